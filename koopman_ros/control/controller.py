@@ -84,7 +84,7 @@ class Controller(ControlStep):
             requested, effective_ns, state.time_ns), len(asked) == len(every))
         if rejection is not None:
             return state, rejection
-        return replace(state, setpoint=requested), None
+        return state._replace(setpoint=requested), None
 
     def _infeasibility(self, state: State, goal: Array, whole: bool) -> Reason | None:
         """Return why a set-point (n_c,) cannot be held as things are, or None."""
@@ -130,7 +130,7 @@ class Controller(ControlStep):
         for name, number in zip(names, value.tolist(), strict=True):
             if not math.isfinite(number):
                 return state, reason(StatusCode.MANUAL_NOT_FINITE, signal=name, value=number)
-        return replace(state, manual_input=read_only(value)), None
+        return state._replace(manual_input=read_only(value)), None
 
     def set_mode(self, state: State, mode: Mode) -> State:
         """
@@ -151,7 +151,7 @@ class Controller(ControlStep):
             estimate = None  # the next measurement starts it
         supervisor = replace(
             state.supervisor, better_since_ns=None) if state.supervisor.latched else Supervisor()
-        return replace(state, mode=mode, manual_input=None, supervisor=supervisor,
+        return state._replace(mode=mode, manual_input=None, supervisor=supervisor,
                        recovery=None, estimate=estimate, history=History())
 
     def take_analysis(self, state: State, signal: str, value: float, stamp_ns: int
@@ -193,7 +193,7 @@ class Controller(ControlStep):
             return state, reason(
                 StatusCode.LATCH_KEPT, recovery_time=self.order.recovery_time,
                 cause=why if why.cause is None else why.cause)
-        return replace(state, supervisor=Supervisor()), None
+        return state._replace(supervisor=Supervisor()), None
 
     # Start and exchange of the controller itself.
 
@@ -207,7 +207,7 @@ class Controller(ControlStep):
         applied = numbers('applied input', applied, self.model.inputs.names)
         if state.command is not None or not np.all(np.isfinite(applied)):
             return state
-        return replace(state, command=read_only(self.tuning.limits.within(applied)),
+        return state._replace(command=read_only(self.tuning.limits.within(applied)),
                        applied=state.applied.corrected(applied))
 
     def switch_to(self, predecessor: Controller, state: State) -> State:
@@ -220,13 +220,13 @@ class Controller(ControlStep):
         """
         same = self.controlled.names == predecessor.controlled.names
         every = self.best.controls_all and predecessor.best.controls_all
-        state = replace(state, history=History())
+        state = state._replace(history=History())
         try:
             with np.errstate(all='ignore'):
                 state = self.estimation.take_over(predecessor.estimation, state)
                 if not (same or every):
                     # the next measurement is held until there is another request
-                    state = replace(state, setpoint=setpoints.Setpoint())
+                    state = state._replace(setpoint=setpoints.Setpoint())
                 level = self.levels.get(state.law or '')
                 if (level is None or state.law_input is None or state.estimate is None
                         or state.setpoint.active is None):
@@ -236,12 +236,12 @@ class Controller(ControlStep):
                         self.estimation.feed_forward(state)), None, usual_interval(state),
                     state.target, state.own_command,
                     self.estimation.pending(state, state.commanded_ns or 0))[1]
-                return state if now.u is None else replace(
-                    state, law_input=now.u, law_memory=now.memory, transfer=with_step(
+                return state if now.u is None else state._replace(
+                    law_input=now.u, law_memory=now.memory, transfer=with_step(
                         state.transfer, state.law_input - now.u))
         except BaseException as error:
             contained(error)
-            return replace(state.restarted(state.time_ns), accepted=None,
+            return state.restarted(state.time_ns)._replace(accepted=None,
                            setpoint=state.setpoint if same else setpoints.Setpoint())
 
     # Questions about the loop.

@@ -114,7 +114,7 @@ class StateEstimation:
         follows = u.tolist() == command.tolist()
         if follows and state.applied.values[-1] is command:
             return state, True
-        return replace(state, applied=state.applied.corrected(u)), follows
+        return state._replace(applied=state.applied.corrected(u)), follows
 
     def feed_forward(self, state: State) -> Array | None:
         """Return the rate (n_x,) due to the measured disturbances; None without any."""
@@ -137,7 +137,7 @@ class StateEstimation:
         found = check_disturbances(
             self.tuning.disturbances, signals, before, values,
             np.where(np.isnan(values), np.inf, 0.0) if ages is None else ages, time_ns)
-        state, estimate = replace(state, disturbances=found), state.estimate
+        state, estimate = state._replace(disturbances=found), state.estimate
         if estimate is None:
             return state
         lost = before.lost_for(signals.names, time_ns) * self.tuning.observer_bandwidth > 1.0
@@ -145,7 +145,7 @@ class StateEstimation:
         if not change.any():
             return state
         level = self.level(state.supervisor)
-        return replace(state, estimate=level.estimator.transferred(
+        return state._replace(estimate=level.estimator.transferred(
             estimate, level.model.drift(estimate.x)
             - self.model.disturbance_rate(signals.center + change)))
 
@@ -168,7 +168,7 @@ class StateEstimation:
                 # the model hardly predicts its motion; under the safe input even a
                 # plant that it does not expect to may rest there
                 return np.zeros_like(y)
-            moved = self.predict(replace(state, estimate=replace(before, w=then.w)), time)
+            moved = self.predict(state._replace(estimate=replace(before, w=then.w)), time)
             assert moved is not None
             return self.outputs.of((moved.x - before.x) * self.model.states.scale)
 
@@ -199,7 +199,7 @@ class StateEstimation:
                 and last is not None):
             # the estimate from a frozen sensor is no disturbance
             predicted, history = replace(predicted, w=last.standstill.w), History()
-        now = replace(state, accepted=verdict.accepted, time_ns=time.now_ns, estimate=predicted,
+        now = state._replace(accepted=verdict.accepted, time_ns=time.now_ns, estimate=predicted,
                       history=history)
         return self._remembering(
             now, state, time, x_measured if verdict.fault is None else None, quality
@@ -272,7 +272,7 @@ class StateEstimation:
             return now
         pieces = () if before.command is None or not time.elapsed > 0.0 else tuple(
             self._pieces(before, time))
-        return replace(now, history=now.history.followed_by(
+        return now._replace(history=now.history.followed_by(
             Instant(time.now_ns, now.estimate, pieces, self.feed_forward(before),
                     None if x is None else self.model.states.to_deviation(x),
                     self._factor(quality)), self._longest_ns))
@@ -283,7 +283,7 @@ class StateEstimation:
 
     def predicted(self, state: State, time: StepTime) -> State:
         """Return the state at a time without a measurement."""
-        return self._remembering(replace(state, estimate=self.predict(state, time)), state, time)
+        return self._remembering(state._replace(estimate=self.predict(state, time)), state, time)
 
     def corrected(self, state: State, index: int, value: float, stamp_ns: int) -> State | None:
         """Return the state corrected by a late value of a state; None if it is too late."""
@@ -294,8 +294,8 @@ class StateEstimation:
             index, float(states.to_deviation(x)[index]), noise / float(states.scale[index]) or (
                 _ANALYSIS_NOISE * 2.0 * float(states.half_widths[index]))),
             self.level(state.supervisor).estimator)
-        return None if history is None else replace(
-            state, history=history, estimate=history.instants[-1].estimate)
+        return None if history is None else state._replace(
+            history=history, estimate=history.instants[-1].estimate)
 
     def _lost(self, state: State, time: StepTime) -> bool:
         """Whether the state is unknown, because no measurement was accepted for too long."""
@@ -342,7 +342,7 @@ class StateEstimation:
         estimate, old, new = state.estimate, predecessor.model, self.model
         before = predecessor.feed_forward(state)
         if old.disturbances.names != new.disturbances.names:
-            state = replace(state, disturbances=None)
+            state = state._replace(disturbances=None)
         if estimate is None:
             return state
         now_ns = state.commanded_ns or 0  # the time of the estimate
@@ -351,13 +351,13 @@ class StateEstimation:
             estimate = Estimate(estimate.x, np.zeros_like(estimate.w))
         if old is new:
             # the level that acts may be gone, and its model with it
-            return replace(state, estimate=self.transfer_estimate(
+            return state._replace(estimate=self.transfer_estimate(
                 estimate, predecessor.level(state.supervisor), self.level(state.supervisor)))
         x = old.states.to_physical(estimate.x)
         if old.states.names != new.states.names:
             # the new model has its own estimate of the unmeasured states
             x = self.position(None, predecessor.outputs.of(x))
-            return replace(state, accepted=None, recovery=None, estimate=self._started(
+            return state._replace(accepted=None, recovery=None, estimate=self._started(
                 state, new.states.to_deviation(x), self.acting(state, now_ns)))
         # the rates that the old model estimated, per second, which all models share
         former = predecessor.level(state.supervisor).model
@@ -376,4 +376,4 @@ class StateEstimation:
         moved = estimator.transferred(moved, np.zeros_like(moved.w) if forward is None
                                       else -forward)
         # its disturbance is in the old model's units, and distances refer to its data
-        return replace(state, estimate=moved, accepted=None, recovery=None)
+        return state._replace(estimate=moved, accepted=None, recovery=None)

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from enum import Enum
 import math
 from typing import Any, NamedTuple
@@ -39,13 +39,12 @@ class Mode(Enum):
     MANUAL = 'manual'
 
 
-@dataclass(frozen=True, slots=True)
-class State:
+class State(NamedTuple):
     """All that a controller remembers between two measurements."""
 
     mode: Mode = Mode.AUTOMATIC  #: who commands
     #: requested, active and scheduled set-points
-    setpoint: Setpoint = field(default_factory=Setpoint)
+    setpoint: Setpoint = Setpoint()
     #: (n_u,) requested by the operator in manual mode, or None
     manual_input: Array | None = None
     time_ns: int | None = None  #: stamp of the last measurement, or None before the first
@@ -53,14 +52,14 @@ class State:
     command: Array | None = None  #: (n_u,) last command, or None before the first
     commanded_ns: int | None = None  #: when it was given, or None
     #: applied inputs that act, or will act; empty before the first command
-    applied: AppliedInputs = field(default_factory=AppliedInputs)
+    applied: AppliedInputs = AppliedInputs()
     interval: float = np.inf  #: usual seconds between measurements; infinity before the second
     accepted: Accepted | None = None  #: the last accepted measurement
     #: state and disturbance, in the deviations of the acting level's model
     estimate: Estimate | None = None
     disturbances: MeasuredDisturbances | None = None  #: measured ones; None without any so far
-    history: History = field(default_factory=History)  #: of the estimate, for late values
-    supervisor: Supervisor = field(default_factory=Supervisor)  #: which level acts
+    history: History = History()  #: of the estimate, for late values
+    supervisor: Supervisor = Supervisor()  #: which level acts
     #: from the safe input, while it is applied where no law may act, or None
     recovery: SafeStateRecovery | None = None
     law: str | None = None  #: the level whose law gave the last command; None when none did
@@ -71,11 +70,12 @@ class State:
     #: next one is looked for; None at first, and where every state has a set-point
     target: Array | None = None
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        return short_repr(self)
 
     def restarted(self, time_ns: int | None) -> State:
         """Return the state after a measurement, without the parts that may have made it fail."""
-        return replace(self, **WITHOUT_LAW, estimate=None, history=History(),
+        return self._replace(**WITHOUT_LAW, estimate=None, history=History(),
                        recovery=None, target=None, time_ns=time_ns)
 
     @property
@@ -119,30 +119,46 @@ NOTHING_MEASURED = MeasurementReport()
 
 
 class EstimateReport(NamedTuple):
-    """The estimate in the units of the signals."""
+    """The estimate, for which numbers in the units of the signals are calculated when read."""
 
-    state: Array  #: (n_x,) in state units
-    #: (n_u,) as an input that would have the same effect, in input units; NaN where not known
-    disturbance: Array
-    at_bound: bool  #: whether the disturbance is as large as is allowed
-    #: (n_x, n_x) of the state's error, in products of state units; None where not known
-    covariance: Array | None
-    innovation: Innovation | None  #: how well the measurements were predicted, or None
+    estimate: Estimate  #: in scaled deviations
+    estimator: Estimator  #: of the level that acts
 
-    @staticmethod
-    def of(estimate: Estimate, estimator: Estimator) -> EstimateReport:
-        """Return the report of an estimate, even if the estimator fails."""
-        states, inputs, P = estimator.model.states, estimator.model.inputs, estimate.covariance
+    @property
+    def state(self) -> Array:
+        """The estimated state (n_x,), in state units."""
+        return self.estimator.model.states.to_physical(self.estimate.x)
+
+    @property
+    def disturbance(self) -> Array:
+        """The disturbance as an input (n_u,) with the same effect; NaN where not known."""
+        inputs = self.estimator.model.inputs
         try:
-            disturbance = np.asarray(estimator.as_input(estimate.w)) * inputs.scale
-            at_bound = bool(estimator.at_bound(estimate.w))
+            return np.asarray(self.estimator.as_input(self.estimate.w)) * inputs.scale
         except BaseException as error:
             contained(error)
-            disturbance, at_bound = np.full(len(inputs), np.nan), False
-        return EstimateReport(
-            states.to_physical(estimate.x), disturbance, at_bound, None if P is None else (
-                states.scale[:, None] * P[:len(states), :len(states)] * states.scale),
-            estimate.innovation)
+            return np.full(len(inputs), np.nan)
+
+    @property
+    def at_bound(self) -> bool:
+        """Whether the disturbance is as large as is allowed."""
+        try:
+            return bool(self.estimator.at_bound(self.estimate.w))
+        except BaseException as error:
+            contained(error)
+            return False
+
+    @property
+    def covariance(self) -> Array | None:
+        """That of the state's error (n_x, n_x), in products of units; None where not known."""
+        states, P = self.estimator.model.states, self.estimate.covariance
+        return None if P is None else (
+            states.scale[:, None] * P[:len(states), :len(states)] * states.scale)
+
+    @property
+    def innovation(self) -> Innovation | None:
+        """How well the measurements were predicted; None where not known."""
+        return self.estimate.innovation
 
     @property
     def deviation(self) -> Array | None:

@@ -10,7 +10,7 @@ check the measurement -> estimate -> set-point -> level -> law -> transfer -> li
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -133,7 +133,7 @@ class ControlStep(Configuration):
                 fault = None if cause is None else reason(cause)
                 return self._command(now, Verdict(now.accepted, fault), NOTHING_MEASURED, time)
             if now.estimate is None or now.setpoint.active is None:
-                now = replace(now, commanded_ns=time.command_ns)
+                now = now._replace(commanded_ns=time.command_ns)
                 return now, held, self._report(now, now.supervisor.reason)
             x = self.model.states.to_physical(now.estimate.x)
             return self._command(
@@ -175,7 +175,7 @@ class ControlStep(Configuration):
             state.setpoint, self.best.controlled_of(x), self.controlled,
             self.tuning.setpoint_ramp, time.now_ns, time.counted,
             self.tuning.setpoint_filter_time)
-        return state if setpoint is state.setpoint else replace(state, setpoint=setpoint)
+        return state if setpoint is state.setpoint else state._replace(setpoint=setpoint)
 
     def _command(self, state: State, verdict: Verdict, measured: MeasurementReport,
                  time: StepTime) -> tuple[State, Array, StepReport]:
@@ -206,7 +206,7 @@ class ControlStep(Configuration):
         done = done._replace(at_range=done.at_range or at_range, at_rate=at_rate,
                              outside=self.model.inputs.violation(u))
         applied = state.applied.followed_by(time.command_ns, u, self.estimation.dead_ns)
-        state = replace(state, **changes, command=u, commanded_ns=time.command_ns,
+        state = state._replace(**changes, command=u, commanded_ns=time.command_ns,
                         applied=applied, interval=time.interval)
         return state, u, self._report(state, why, measured, target, done)
 
@@ -303,7 +303,7 @@ class ControlStep(Configuration):
                 command: CommandReport = NO_COMMAND) -> StepReport:
         active, manual = state.setpoint.active, state.mode is Mode.MANUAL
         depth = len(self.order.levels) if manual else self.order.depth(state.supervisor.level)
-        known = None if state.estimate is None else EstimateReport.of(
+        known = None if state.estimate is None else EstimateReport(
             state.estimate, self.estimation.level(state.supervisor).estimator)
         steady = () if target is None else (
             target.residual, self.model.states.to_physical(target.x),

@@ -44,7 +44,7 @@ def afresh(state: State, by_ns: int) -> State:
     supervisor = replace(state.supervisor, bad_since_ns=None, better_since_ns=None)
     newest_ns = state.time_ns if state.former_ns is None or state.time_ns is None else max(
         state.time_ns, state.former_ns)
-    return replace(state, time_ns=None, former_ns=newest_ns, commanded_ns=None, accepted=None,
+    return state._replace(time_ns=None, former_ns=newest_ns, commanded_ns=None, accepted=None,
                    applied=state.applied.shifted(by_ns), supervisor=supervisor, recovery=None,
                    disturbances=state.disturbances and state.disturbances.shifted(by_ns),
                    setpoint=replace(state.setpoint, scheduled=()), history=History())

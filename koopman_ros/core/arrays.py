@@ -26,9 +26,10 @@ def along_last(*parts: ArrayLike) -> Array:
 
 
 def short_repr(holder: object) -> str:
-    """Describe a dataclass on one line: long arrays by their shape, other dataclasses by name."""
-    shown = ', '.join(f'{field.name}={_brief(getattr(holder, field.name))}'
-                      for field in fields(cast(Any, holder)) if field.repr)
+    """Describe a dataclass or named tuple on one line: long arrays by shape, others by name."""
+    names = getattr(holder, '_fields', ()) or [
+        field.name for field in fields(cast(Any, holder)) if field.repr]
+    shown = ', '.join(f'{name}={_brief(getattr(holder, name))}' for name in names)
     return f'{type(holder).__name__}({shown})'
 
 

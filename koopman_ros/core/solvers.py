@@ -14,7 +14,7 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.status import StatusCode
 
 __all__ = ['RiccatiSolution', 'differences', 'over_interval', 'runge_kutta_step', 'solve_riccati',
-           'spectral_radius', 'transition']
+           'spectral_radius']
 
 # A double eigenvalue of the Hamiltonian on the imaginary axis comes out split by about the square
 # root of the rounding error: modes within that of the axis look undamped.
@@ -42,6 +42,7 @@ class RiccatiSolution(NamedTuple):
     K: Array  #: (m, n); zeros without a solution
     residual: float  #: Frobenius norm of the equation's left side over the sum of its terms' norms
     gain: float  #: spectral norm of K
+    loop: Array  #: (n, n) A - B K, or the transition of the closed loop over an interval
     failure: StatusCode | None  #: why K must not be used, None where it may
 
     @property
@@ -75,62 +76,71 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, interval: float = 0
     try:
         # values so large that something overflows end in a residual or a gain that is rejected
         with np.errstate(all='ignore'):
-            P, K, residual = _sampled(A, B, Q, R, interval) if interval > 0.0 else _continuous(
-                A, B, Q, R)
+            P, K, residual, loop = _sampled(A, B, Q, R, interval) if interval > 0.0 else (
+                _continuous(A, B, Q, R))
             gain = float(np.linalg.norm(K, 2)) if min(K.shape) > 1 else _size(K)
     except (ArithmeticError, ValueError):
         # a singular matrix, no stable subspace, or numbers that are not finite
-        return RiccatiSolution(np.zeros_like(A), np.zeros_like(B.T), math.inf, math.inf,
+        return RiccatiSolution(np.zeros_like(A), np.zeros_like(B.T), math.inf, math.inf, A,
                                StatusCode.NOT_STABILISABLE)
-    return RiccatiSolution(P, K, residual, gain, (
+    return RiccatiSolution(P, K, residual, gain, loop, (
         StatusCode.RICCATI_INACCURATE if not residual <= max_residual else
         StatusCode.GAIN_TOO_LARGE if not gain <= max_gain else None))
 
 
-def _continuous(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array, float]:
-    """Return P, K and the residual, by A. J. Laub, IEEE Trans. Automat. Contr. 24 (1979)."""
+def _continuous(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array, float, Array]:
+    """
+    Return P, K, the residual and the closed loop.
+
+    By A. J. Laub, IEEE Trans. Automat. Contr. 24 (1979).
+    """
     R_inverse_Bt = _solved(R, B.T)
     G = B @ R_inverse_Bt
-    H = np.block([[A, -G], [-Q, -A.T]])
-    scale = _balanced(H)
-    P = scale * _stable_graph(H)
+    scale = _scale(_size(Q), _size(G))
+    P = scale * _stable_graph(np.block([[-A.T, -Q / scale], [-scale * G, A]]))
     PA, PGP = P @ A, P @ G @ P
     # the rounding of the sum grows with its terms, so that Q alone would be too strict a measure
     size = _size(Q) + 2.0 * _size(PA) + _size(PGP)
-    return P, R_inverse_Bt @ P, _size(PA + PA.T - PGP + Q) / size
+    K = R_inverse_Bt @ P
+    return P, K, _size(PA + PA.T - PGP + Q) / size, A - B @ K
 
 
 def _sampled(A: Array, B: Array, Q: Array, R: Array, interval: float
-             ) -> tuple[Array, Array, float]:
+             ) -> tuple[Array, Array, float, Array]:
     """
     Return the same of the sampled regulator.
 
     The Cayley transform (S + I)^-1 (S - I) of the symplectic pencil is a Hamiltonian matrix with
     the same stable subspace. It inverts no transition matrix, so that modes may decay as fast as
-    they like within an interval.
+    they like within an interval. The held input is a third part of the pencil, next to costate
+    and state.
     """
     n = len(A)
     D, W = over_interval(A, B, Q, R, interval)
-    less = np.zeros((2 * n, 2 * n))
-    less[:n, :n], less[n:, :n], less[n:, n:] = D[:n, :n], -W[:n, :n], -D[:n, :n].T
-    # without the cross term of input and state
-    less -= np.concatenate((D[:n, n:], -W[:n, n:])).dot(
-        _solved(W[n:, n:], np.concatenate((W[:n, n:], D[:n, n:])).T))
-    scale = _balanced(less)
+    D, size_Q = D[:n], _size(W[:n, :n])
+    scale = _scale(size_Q, _size(D[:, n:]) ** 2 / (_size(W[n:, n:]) or 1.0))
+    size = n + len(W)
+    less = np.zeros((size, size))
+    less[:n, n:], less[n:, :n], less[n:, n:] = D, -D.T, W / -scale
     more = less.copy()
-    more[:, n:] *= -1.0
-    more.flat[::2 * n + 1] += 2.0
-    size = (_size(A) + _size(B)) * interval
-    P = scale * _stable_graph(_solved(more, less), _ROUNDING * min(size, 1.0))
-    PD = P.dot(D[:n])
-    square = D[:n].T.dot(PD)
-    cost, P_step = W + square, PD[:, :n]
-    right = cost[n:, :n] + PD[:, n:].T
+    more[n:, :n] = D.T
+    diagonals = more.ravel()
+    diagonals[n:n * size:size + 1] += 2.0
+    diagonals[n * size:2 * n * size:size + 1] += 2.0
+    least = min((_size(A) + _size(B)) * interval, 1.0)
+    P = scale * _stable_graph(_solved(more, less[:, :2 * n])[:2 * n], _ROUNDING * least)
+    PD = P.dot(D)
+    # [Phi, Gamma]'P [Phi, Gamma] + W less P, whose terms shrink with the interval
+    cost = W + D.T.dot(PD)
+    cost[:n] += PD
+    cost[:, :n] += PD.T
+    right = cost[n:, :n]
     K = _solved(cost[n:, n:], right)
-    # the equation less P on both sides, whose terms shrink with the interval
     feedback = right.T.dot(K)
-    terms = _size(W[:n, :n]) + 2.0 * _size(P_step) + _size(square[:n, :n]) + _size(feedback)
-    return P, K, _size(P_step + P_step.T + cost[:n, :n] - feedback) / terms
+    loop = D[:, :n] - D[:, n:].dot(K)
+    loop.ravel()[::n + 1] += 1.0
+    terms = size_Q + 2.0 * _size(PD[:, :n]) + _size(feedback)
+    return P, K, _size(cost[:n, :n] - feedback) / terms, loop
 
 
 def over_interval(A: Array, B: Array, Q: Array, R: Array, interval: float
@@ -143,48 +153,29 @@ def over_interval(A: Array, B: Array, Q: Array, R: Array, interval: float
 
     :return: with y = (x, u), the D (n + m, n + m) of y(interval) = (I + D) y(0), which keeps its
         digits where the interval is short, and W of the cost y(0)'W y(0).
-    :raises numpy.linalg.LinAlgError: where they are not finite.
     """
     n, m = B.shape
     N = n + m
-    M = np.zeros((2 * N, 2 * N))
+    powers = np.zeros((4, 2 * N, 2 * N))
+    M, M2, M3, M4 = powers
     M[N:N + n, N:N + n], M[N:N + n, N + n:] = A, B
     M[:N, :N] = -M[N:, N:].T
-    size = _size(M) * interval
+    doublings = max(0, math.frexp(1.5 * _size(M) * interval)[1])
     M[:n, N:N + n], M[n:N, N + n:] = Q, R
-    if not math.isfinite(_size(M)):
-        raise np.linalg.LinAlgError('plant or weights are not finite')
-    total, doublings = _part(M, interval, size)
+    M *= math.ldexp(interval, -doublings)
+    M.dot(M, out=M2)
+    M2.dot(M, out=M3)
+    M2.dot(M2, out=M4)
+    *parts, total = _SERIES.dot(powers.reshape(4, -1)).reshape(powers.shape)
+    for part in reversed(parts):
+        total = part + M4.dot(total)
     D, W = total[N:, N:], total[:N, N:]
-    W = 0.5 * (W + D.T.dot(W))
-    W = W + W.T
+    W = W + D.T.dot(W)
     for _ in range(doublings):
         DW = D.T.dot(W)
         W = 2.0 * W + DW + DW.T + DW.dot(D)
         D = 2.0 * D + D.dot(D)
     return D, W
-
-
-def transition(A: Array, interval: float) -> Array:
-    """Return exp(A interval) (n, n), by the same series."""
-    D, doublings = _part(A, interval, _size(A) * interval)
-    for _ in range(doublings):
-        D = 2.0 * D + D.dot(D)
-    D.flat[::len(A) + 1] += 1.0
-    return D
-
-
-def _part(M: Array, interval: float, size: float) -> tuple[Array, int]:
-    """Return exp(M h) - I for a part h of an interval, and how often h doubles to all of it."""
-    doublings = max(0, math.frexp(1.5 * size)[1])
-    M = M * math.ldexp(interval, -doublings)
-    M2 = M.dot(M)
-    M4 = M2.dot(M2)
-    powers = np.concatenate((M, M2, M2.dot(M), M4)).reshape(4, -1)
-    *parts, total = _SERIES.dot(powers).reshape(-1, *M.shape)
-    for part in reversed(parts):
-        total = part + M4.dot(total)
-    return total, doublings
 
 
 def spectral_radius(M: Array) -> float:
@@ -204,21 +195,16 @@ def _solved(M: Array, right: Array) -> Array:
     return np.asarray(found, dtype=np.float64)
 
 
-def _balanced(H: Array) -> float:
-    """Divide P for order one, in place, so that no block dominates; return the divisor."""
-    n = len(H) // 2
-    G, Q = H[:n, n:], H[n:, :n]
-    size_G, size_Q = _size(G), _size(Q)
-    scale = math.sqrt(size_Q / size_G) if size_G > 0.0 and size_Q > 0.0 else 1.0
-    G *= scale
-    Q /= scale
-    return scale
+def _scale(size_Q: float, size_G: float) -> float:
+    """Return a divisor of P for order one, so that no block of the Hamiltonian dominates."""
+    return math.sqrt(size_Q / size_G) if size_Q > 0.0 and size_G > 0.0 else 1.0
 
 
 def _stable_graph(H: Array, least: float = 0.0) -> Array:
     """
-    Return the P whose graph is the stable subspace of a Hamiltonian matrix.
+    Return the P whose graph is the stable subspace of a Hamiltonian matrix, costate P state.
 
+    :param H: (2 n, 2 n) of costate and state.
     :param least: distance of its modes from the imaginary axis.
     :raises numpy.linalg.LinAlgError: where that subspace has not full size.
     """
@@ -229,7 +215,7 @@ def _stable_graph(H: Array, least: float = 0.0) -> Array:
     _, stable, real, _, vectors, _, info = dgees(lambda real, _: real < 0.0, H, sort_t=1)
     if info != 0 or stable != n or not max(real[:n].tolist()) < -max(least, _AXIS_MARGIN * size):
         raise np.linalg.LinAlgError('no stable subspace of full dimension exists')
-    P = _solved(vectors[:n, :n].T, vectors[n:, :n].T)
+    P = _solved(vectors[n:, :n].T, vectors[:n, :n].T)
     return 0.5 * (P + P.T)
 
 

@@ -4,7 +4,7 @@
 """The replay: a loop over the records of controllers, which gives their commands again."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 from koopman_ros.control import Controller, Setpoint, State
@@ -185,8 +185,8 @@ class _ReplayRun:
         # it may reject a request: then the tracked set-point counts
         if self._other is not None and not isinstance(event, SetpointRequest):
             if active is not None and isinstance(event, Measurement):
-                self._other_state = replace(
-                    self._other_state, setpoint=Setpoint(active, active))
+                self._other_state = self._other_state._replace(
+                    setpoint=Setpoint(active, active))
             answered = apply(self._other_controller, self._other_state, event)
             self._other_state, other = answered.state, answered.command
         self._keep(record, active, outcome.command, other)

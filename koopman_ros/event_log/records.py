@@ -8,8 +8,8 @@ They are described in docs/reference/event_log.md.
 
 Numbers are in the model's units, times in nanoseconds. JSON has numbers, texts, lists and objects.
 Other values are an object with the key ``@``, which names their kind: ``float`` for one that is
-not finite, ``array``, or the class of a dataclass or an enum as ``module:name``. Lists become
-tuples.
+not finite, ``array``, or the class of a dataclass, a named tuple or an enum as ``module:name``.
+Lists become tuples.
 """
 
 from collections.abc import Mapping
@@ -172,13 +172,13 @@ def encoded(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return {_TAG: 'array', 'dtype': value.dtype.str, 'shape': list(value.shape),
                 'values': numbers(value.ravel())}
-    if isinstance(value, (tuple, list)):
-        return [encoded(item) for item in value]
     if isinstance(value, Mapping):
         return {str(key): encoded(item) for key, item in value.items()}
-    if is_dataclass(value) and not isinstance(value, type):
+    if names := _names_of(type(value)):
         return {_TAG: _name(type(value)), **{
-            item.name: encoded(getattr(value, item.name)) for item in fields(value)}}
+            name: encoded(getattr(value, name)) for name in names}}
+    if isinstance(value, (tuple, list)):
+        return [encoded(item) for item in value]
     raise TypeError(f'a {type(value).__name__} cannot be written to a record')
 
 
@@ -186,7 +186,7 @@ def decoded(value: Any) -> Any:
     """
     Return the value that :func:`encoded` was given.
 
-    A class has to be loaded, and a dataclass or an enum: no text of a bag imports anything.
+    A class has to be loaded, and hold data or be an enum: no text of a bag imports anything.
 
     :raises ValueError: for a class that is not known here.
     :raises TypeError: for one that has other fields here.
@@ -209,7 +209,7 @@ def decoded(value: Any) -> Any:
             return array
         case name:
             kind = loaded_class(str(name))
-            if not (is_dataclass(kind) or issubclass(kind, Enum)):
+            if not (_names_of(kind) or issubclass(kind, Enum)):
                 raise ValueError(f'the class {name!r} holds no data')
             if issubclass(kind, Enum):
                 return kind[rest['name']]
@@ -229,6 +229,12 @@ def float_array(values: Any) -> NDArray[np.float64]:
     array = np.array([float(item) for item in values], dtype=np.float64)
     array.setflags(write=False)
     return array
+
+
+def _names_of(kind: type) -> tuple[str, ...]:
+    """Return the names of the fields of a named tuple or a dataclass; none of another class."""
+    names: tuple[str, ...] = getattr(kind, '_fields', ())
+    return tuple(item.name for item in fields(kind)) if is_dataclass(kind) else names
 
 
 def _name(kind: type) -> str:

@@ -4,7 +4,7 @@
 """Test vectors: a loop with faults, answered by the controller that is exported."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -58,7 +58,7 @@ def answered(controller: Controller, state: State, call: Call, now_ns: int
     """Return the controller's answer to a call at a time in ns."""
     given, box = ~np.isnan(call.setpoint), controller.controlled
     if ((call.setpoint >= box.lower) & (call.setpoint <= box.upper))[given].all():
-        state = replace(state, setpoint=setpoints.request(
+        state = state._replace(setpoint=setpoints.request(
             state.setpoint, call.setpoint, 0, state.time_ns))
     if call.measured is not None:
         return controller.step(state, call.measured, now_ns, call.applied,

@@ -440,7 +440,7 @@ class LiftedModel:
     def forcing(self, x: Array, u: Array) -> Array:
         """Evaluate B(x) u, the rate due to inputs: (..., n_x), (..., n_u) -> (..., n_x)."""
         if self.input_terms is None:
-            return u @ self.B.T
+            return u.dot(self.B.T)
         return (self.input_matrix(x) @ u[..., None])[..., 0]
 
     def forcing_jacobian(self, x: Array, u: Array) -> Array:
@@ -457,7 +457,7 @@ class LiftedModel:
         :param w: (..., n_x) disturbance.
         """
         if self.input_terms is None:
-            constant = u @ self.B.T + w
+            constant = u.dot(self.B.T) + w
             return lambda x: self.drift(x) + constant
         return lambda x: self.drift(x) + self.forcing(x, u) + w
 
@@ -529,9 +529,9 @@ class LiftedModel:
         """Evaluate f, the rate of the state without inputs: (..., n_x) -> same; f(0) = 0."""
         x = self.states.array('state', x)
         if self._weights is not None:
-            return self.observables.features.lift(x) @ self._weights.T
+            return self.observables.features.lift(x).dot(self._weights.T)
         z, J = self.observables.lift_and_jacobian(x)
-        f = (self.onto_states(J) @ (z @ self.A.T)[..., None])[..., 0]
+        f = (self.onto_states(J) @ z.dot(self.A.T)[..., None])[..., 0]
         return f if self.pre_feedback is None else f - self.pre_feedback_rate(x)
 
     @cached_property

@@ -140,28 +140,24 @@ class NetworkObservables(Observables):
 
     def secants(self, x: Array, x_ref: Array, w: Array) -> tuple[Array, Array, Array]:
         """Evaluate the secants, by divided differences of tanh and of its slope."""
-        a, a_ref = arguments = np.array((x, x_ref)).dot(self.W.T) + self.b
-        h, h_ref = np.tanh(arguments)
+        h, h_ref, apart = self._hidden(x), self._hidden(x_ref), self.W.dot(x - x_ref)
         # tanh a - tanh r = tanh(a - r) (1 - tanh a tanh r); the offset makes the ratio 1 at 0
-        apart = a - a_ref
         apart += np.copysign(1e-300, apart)
         secant = np.tanh(apart) / apart * (1.0 - h * h_ref)
-        found = self._bent(np.array((
+        J, M, H = self._bent(np.array((
             1.0 - h * h, secant, -(h + h_ref) * secant * self.W.dot(w))))
-        found[:2] += self._of_states
-        J, M, H = found
-        return J, M, H
+        return J + self._of_states, M + self._of_states, H
 
     def _hidden(self, x: Array) -> Array:
-        return np.tanh(x @ self.W.T + self.b)
+        return np.tanh(x.dot(self.W.T) + self.b)
 
     def _lifted(self, x: Array, h: Array) -> Array:
-        free: Array = (h - self.value_at_zero) @ self.V.T
+        free: Array = (h - self.value_at_zero).dot(self.V.T)
         return np.concatenate((x, free), axis=-1) if self.identity else free
 
     def _bent(self, slope: Array) -> Array:
         """Return V diag(slope) W below zeros for the states: (..., h) -> (..., n_z, n_x)."""
-        return (slope @ self._products).reshape(*slope.shape[:-1], self.n_z, self.n_x)
+        return slope.dot(self._products).reshape(*slope.shape[:-1], self.n_z, self.n_x)
 
     @cached_property
     def _of_states(self) -> Array:

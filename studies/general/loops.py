@@ -56,8 +56,7 @@ def known(name: str, starts: int) -> Known:
         scale = model.states.scale
         A = case.factorised(model.states.to_physical(x)) * scale / scale[:, None]
         found = solve_riccati(A, model.B, weights.Q, weights.R)
-        return Feedback(target.u - found.K @ (x - target.x), Form.AVERAGED, found, A,
-                        -model.B @ found.K)
+        return Feedback(target.u - found.K @ (x - target.x), Form.AVERAGED, found, found.loop)
 
     return Known(tuple(loops(case, case.truth, starts)),
                  tuple(loops(case, case.truth, starts, natural)))

@@ -82,7 +82,7 @@ def linearised_controller(controller: Controller, temperature: float) -> control
     assert rest is not None
 
     def stepped(x: Array, w: Array, u: Array, y: Array) -> tuple[State, Array]:
-        state = replace(before, estimate=Estimate(x, w), transfer=None, command=u,
+        state = before._replace(estimate=Estimate(x, w), transfer=None, command=u,
                         applied=before.applied.corrected(u))
         return controller.step(state, y, 3 * NANOSECONDS)[:2]
 
@@ -221,7 +221,7 @@ def back_from_safe(system: ControlAffineSystem, linear_model_margin: float) -> M
                             coldest, 320.0)])
 
     def safe(before: Loop) -> Loop:
-        return replace(before, state=replace(before.state, supervisor=Supervisor(SAFE)))
+        return replace(before, state=before.state._replace(supervisor=Supervisor(SAFE)))
 
     course = loop.run_loop(
         loop.reactor_controller(linear_model_margin=linear_model_margin), system, _RETURN,

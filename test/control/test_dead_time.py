@@ -93,7 +93,7 @@ def test_a_takeover_a_record_and_a_fallback_keep_the_inputs_under_way():
     np.testing.assert_allclose(again.commands, whole.commands, rtol=0, atol=1e-9)
     half = step(loop, plant, state, 20.0).loop.state
     assert len(half.applied.times_ns) == 21
-    forgetful = replace(half, applied=AppliedInputs().corrected(half.command))
+    forgetful = half._replace(applied=AppliedInputs().corrected(half.command))
     now_ns = half.time_ns + SECOND
     commands = [loop.step(one, np.array([START]), now_ns)[1][0] for one in (half, forgetful)]
     assert commands[0] == pytest.approx(whole.commands[21, 0], abs=0.2)
@@ -108,7 +108,7 @@ def test_a_prediction_that_diverges_is_a_failure_of_the_level():
     hot = np.array([loop.model.states.upper[0]])
     applied = AppliedInputs().corrected(np.array([1e3])).followed_by(
         0, state.command, loop.estimation.dead_ns)
-    _, command, report = loop.step(replace(state, applied=applied), hot, SECOND)
+    _, command, report = loop.step(state._replace(applied=applied), hot, SECOND)
     assert report.level == 'hold'
     assert report.reason.cause.code is StatusCode.NOT_PREDICTED
     assert report.reason.cause.values['seconds'] < 3600.0

@@ -155,7 +155,7 @@ def test_weights_on_the_input_stay_so_under_a_pre_feedback(reference):
                 np.testing.assert_allclose(found.riccati.K, wanted.riccati.K, rtol=1e-8,
                                            atol=1e-12)
                 np.testing.assert_allclose(found.u, wanted.u, rtol=1e-8)
-                np.testing.assert_allclose(found.drift, wanted.drift, rtol=1e-8, atol=1e-10)
+                np.testing.assert_allclose(found.loop, wanted.loop, rtol=1e-8, atol=1e-10)
 
 
 # Choice of the law.
@@ -222,8 +222,7 @@ def test_recentred_law_of_a_free_lift_by_hand(x, reference, k):
     found = recentred(model, np.array([x]), target, Weights(q * np.eye(1), r * np.eye(1)))
     assert found.solved
     assert found.u[0] == pytest.approx(target.u[0] - p * b * J / r * (t - t_ref), rel=1e-10)
-    assert found.drift[0, 0] * (x - reference) == pytest.approx(
-        model.drift(np.array([x]))[0] - model.drift(np.array([reference]))[0], rel=1e-10)
+    assert found.loop[0, 0] == pytest.approx(a - (b * J) ** 2 * p / r, rel=1e-10)
 
 
 @pytest.mark.parametrize('x', [1.3, -0.8, 1e-3])
@@ -265,7 +264,8 @@ def test_the_averaged_law_has_a_gain_where_the_secant_of_the_lift_has_none():
     found = feedback(model, x, steady_state_target(model, origin),
                      Weights(np.eye(2), np.eye(1)))
     assert found.form is Form.AVERAGED
-    np.testing.assert_allclose(found.drift, [[1.0 - g, across], [1.0, g]], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(found.loop + model.B @ found.riccati.K,
+                               [[1.0 - g, across], [1.0, g]], rtol=0, atol=1e-5)
     assert found.solved
     assert found.riccati.gain < 10.0
 
@@ -312,14 +312,18 @@ def test_a_sampled_law_is_nearly_optimal_at_long_intervals(law):
     assert cost_along(*unaware) > 1.5 * least
 
 
-def test_an_interval_makes_gains_smaller_and_predictions_stable():
+def test_an_interval_makes_gains_smaller_and_the_loop_stable():
     model = shipped('reactor_nz4')
     arguments = (model, np.array([-0.5]), setpoint_target(model), reactor_weights(model, 1e-6))
     unaware, aware = (feedback(*arguments, interval=h, max_gain=1e9) for h in (0.0, 1.0 / 60.0))
     assert unaware.solved
     assert aware.solved
     assert aware.riccati.gain < 0.5 * unaware.riccati.gain
-    assert aware.growth(1.0 / 60.0) < 1.0 < unaware.growth(1.0 / 60.0)
+    assert aware.growth(1.0 / 60.0) < 1.0
+    # the continuous gain moves the input too far within a second
+    a, b = model.averaged_drift_jacobian(arguments[1], arguments[2].x)[0, 0], model.B[0, 0]
+    k = (arguments[2].u - unaware.u)[0] / (arguments[1] - arguments[2].x)[0]
+    assert np.exp(a / 60.0) - np.expm1(a / 60.0) / a * b * k < -1.0
 
 
 def test_the_linear_law_is_solved_for_the_interval():
@@ -341,9 +345,8 @@ def test_a_law_that_is_predicted_unstable_is_not_used():
     estimate = Estimate(np.array([-0.5]), np.zeros(1))
     law = LAWS['sdre'](model, Tuning.for_model(model, input_weight=[1e-9], max_gain=1e9), None)
     with pytest.MonkeyPatch.context() as patched:
-        # a gain for continuous time under a sample a second
-        patched.setattr(riccati, 'feedback', lambda *arguments, interval, **bounds: feedback(
-            *arguments, **bounds))
+        patched.setattr(riccati, 'feedback', lambda *arguments, **how: feedback(
+            *arguments, **how)._replace(loop=np.array([[-1.01]])))
         rejected = law.compute(estimate, setpoint_target(model), None, 1.0, None)
     assert rejected.failure.code is StatusCode.PREDICTED_UNSTABLE
     assert rejected.failure.values['interval'] == 1.0

@@ -157,7 +157,7 @@ def test_a_set_point_is_feasible_where_the_feed_allows_it():
     for kelvin, rejected in ((NOMINAL, False), (NOMINAL + 60.0, True)):
         state = loop.step(loop.initialise(State(), np.array([290.0])), np.array([START]), SECOND,
                           disturbances=np.array([kelvin]))[0]
-        state = replace(state, estimate=replace(state.estimate, w=np.zeros(1)))
+        state = state._replace(estimate=replace(state.estimate, w=np.zeros(1)))
         why = loop.request_setpoint(state, np.array([START - 12.0]))[1]
         assert (why is not None) is rejected
 

@@ -3,7 +3,6 @@
 
 """Set-points for some of the states: tanks, and other models, whose steady states are known."""
 
-from dataclasses import replace
 import math
 
 import numpy as np
@@ -69,7 +68,7 @@ def asked(controller, value, state=None, **others):
 def disturbed(controller, x, w):
     """Return a state in which a disturbance (n_x,), in units per second, is estimated."""
     state = stepped(controller, State(), x, 0)[0]
-    return replace(state, estimate=Estimate(
+    return state._replace(estimate=Estimate(
         state.estimate.x, np.array(w) / controller.model.states.scale))
 
 
@@ -153,7 +152,7 @@ def test_where_there_is_no_steady_state_the_law_fails_and_nothing_raises():
     state = disturbed(controller, [1.0, 1.0], [0.0, 0.0])
     state, rejected = asked(controller, 0.5, state)
     assert rejected is None
-    state = replace(state, estimate=Estimate(state.estimate.x, np.array([0.0, 0.7])))
+    state = state._replace(estimate=Estimate(state.estimate.x, np.array([0.0, 0.7])))
     state, command, report = controller.step(
         state, np.array([1.0, 1.0]), EPOCH + SECOND // 1000)
     assert report.level == 'linear'

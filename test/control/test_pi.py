@@ -3,7 +3,6 @@
 
 """The PI law: its equation, limits without windup, hand-over, and a plant without a model."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -101,7 +100,7 @@ def test_it_begins_where_another_law_ended():
 def test_it_takes_no_memory_of_another_law():
     loop = run(controller(), seconds=20.0).loop
     fresh, foreign = (
-        loop.controller.step(replace(loop.state, law='mine', law_memory=memory), np.array([4.0]),
+        loop.controller.step(loop.state._replace(law='mine', law_memory=memory), np.array([4.0]),
                              loop.state.time_ns + SECOND)[1]
         for memory in (None, np.array([100.0])))
     np.testing.assert_array_equal(foreign, fresh)

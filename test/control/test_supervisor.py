@@ -116,8 +116,8 @@ def test_only_the_operator_clears_a_latched_safe_input():
         return state.supervisor, rejected and rejected.code
 
     assert cleared()[1] is StatusCode.NOT_LATCHED
-    loop.loop = replace(loop.loop, state=replace(
-        loop.loop.state, supervisor=Supervisor.latched_before()))
+    loop.loop = replace(loop.loop, state=loop.loop.state._replace(
+        supervisor=Supervisor.latched_before()))
     assert levels(loop.run(5)) == ['safe']
     # manual mode and back does not, and the law has to be possible again for long enough
     loop.do(ModeChange(Mode.MANUAL), ModeChange(Mode.AUTOMATIC))

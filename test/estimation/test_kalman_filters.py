@@ -451,7 +451,7 @@ def test_an_estimate_that_strayed_from_the_data_is_corrected():
 
     def strayed(loop: Loop) -> Loop:
         estimate = loop.state.estimate
-        return replace(loop, state=replace(loop.state, estimate=replace(
+        return replace(loop, state=loop.state._replace(estimate=replace(
             estimate, x=estimate.x + np.array([2.0, 0.0]), covariance=None)))
 
     loop = simulate(saddle(), Process(SYSTEM, 0, x0, u0), [

@@ -346,7 +346,7 @@ def failing(law_input=None, solved=lambda x: True):
         riccati = found.riccati
         if not solved(x):
             riccati = solve_riccati(np.eye(1), np.zeros((1, 1)), np.eye(1), np.eye(1))
-        return Feedback(u, Form.AVERAGED, riccati, found.drift, found.action)
+        return Feedback(u, Form.AVERAGED, riccati, found.loop)
     return law
 
 

@@ -11,12 +11,13 @@ from builtin_interfaces.msg import Time
 import numpy as np
 from sensor_msgs.msg import JointState
 
-from koopman_ros.control import Mode, StepReport
+from koopman_ros.control import Controller, Mode, StepReport, Tuning
 from koopman_ros.control.laws import Plan
 from koopman_ros.control.state import EstimateReport
-from koopman_ros.core.paths import config_directory
+from koopman_ros.core.paths import config_directory, model_path
 from koopman_ros.demo import reactor
-from koopman_ros.estimation import Innovation
+from koopman_ros.estimation import Estimate, Innovation
+from koopman_ros.model import load
 from koopman_ros.parameters.trainer_table import preset_wiring
 from koopman_ros.ros import topics
 from koopman_ros.ros.controller_messages import active_constraints, internals
@@ -32,7 +33,9 @@ assert WIRING is not None
 TYPES = {topic: kind for topic, (kind, _) in topics.expected_topics(WIRING).items()}
 ONE, NONE = np.ones(1), np.zeros(1)
 # by a Kalman filter, which says more than the observer, and a law that plans
-ESTIMATE = EstimateReport(ONE, NONE, False, np.eye(1), Innovation(NONE, 1.0, 1))
+MODEL = load(model_path('reactor_nz4'))
+ESTIMATE = EstimateReport(Estimate(NONE, NONE, np.eye(2), Innovation(NONE, 1.0, 1)),
+                          Controller(MODEL, Tuning.for_model(MODEL)).best.estimator)
 PLAN = Plan(np.arange(2.0), np.ones((2, 1)), np.ones((1, 1)), NONE, NONE, NONE)
 NAMES = {
     topics.CONTROLLER_INTERNALS: list(internals(WIRING.signals, StepReport(

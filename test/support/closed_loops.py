@@ -91,7 +91,12 @@ say = StatusFormatter(Displays({'temperature': 'K', 'coolant_temperature': 'K'})
 
 
 def content(value: Any) -> str:
-    """Write states, commands and reports so that they compare bit for bit."""
+    """Write a state, or the result of a step, so that they compare bit for bit."""
+    if not isinstance(value, control.State):
+        state, command, report = value
+        found = report.estimate
+        value = state, command, replace(report, estimate=None), found and (
+            found.state, found.disturbance, found.at_bound, found.covariance, found.innovation)
     return json.dumps(encoded(value), sort_keys=True)
 
 

@@ -23,7 +23,6 @@ from koopman_ros.core.solvers import (
     RiccatiSolution,
     solve_riccati,
     spectral_radius,
-    transition,
 )
 from koopman_ros.core.status import reason, StatusCode
 from koopman_ros.estimation import Estimate
@@ -48,8 +47,9 @@ class Feedback(NamedTuple):
     u: Array  #: (n_u,) u_ref - K e in scaled deviations; not to be used unless solved
     form: Form  #: which form produced it
     riccati: RiccatiSolution  #: the solution with its residual, gain and status
-    drift: Array  #: (n_x, n_x) A_x of the error e = x - x_ref, e' = A_x e + B v
-    action: Array  #: (n_x, n_x) -B K in terms of that error, so that e' = (A_x + action) e
+    #: (n_x, n_x) closed loop of the error e = x - x_ref: e' = loop e, or its transition over an
+    #: interval
+    loop: Array
 
     @property
     def solved(self) -> bool:
@@ -60,20 +60,13 @@ class Feedback(NamedTuple):
         """
         Predict by which factor the error's largest mode changes from one sample to the next.
 
-        The input is held between samples. Without an interval it is that of the continuous loop
-        over one unit of time.
+        Without an interval it is that of the continuous loop over one unit of time.
 
-        :param interval: between samples in the model's time unit; 0 when it is not known.
+        :param interval: between samples, for which it was solved; 0 when it is not known.
         :return: 1 and more, or NaN, when the loop is predicted not to be stable.
         """
-        n = len(self.drift)
-        if not interval > 0.0:
-            loop = self.drift + self.action
-            return float(np.exp(np.max(np.linalg.eigvals(loop).real)))
-        held = np.zeros((2 * n, 2 * n))
-        held[:n, :n], held[:n, n:] = self.drift, self.action
-        step = transition(held, interval)[:n]
-        return spectral_radius(step[:, :n] + step[:, n:])
+        return spectral_radius(self.loop) if interval > 0.0 else float(
+            np.exp(np.max(np.linalg.eigvals(self.loop).real)))
 
 
 def closed(model: LiftedModel) -> bool:
@@ -134,11 +127,10 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights,
         C = np.linalg.pinv(M)
         A, Q = model.A + H @ C, C.T @ weights.Q @ C
     riccati = solve_riccati(A, J.dot(B), Q, weights.R, **how)
-    drift = (model.onto_states(J).dot(A.dot(M)) if model.readout is None
-             else _averaged_jacobian(model, x, target, D))
     # N(x) - N(x_ref) = M e
-    K = riccati.K.dot(M)
-    return Feedback(target.u - K.dot(x - target.x), Form.RECENTRED, riccati, drift, -B.dot(K))
+    loop = riccati.loop.dot(M)
+    return Feedback(target.u - riccati.K.dot(M.dot(x - target.x)), Form.RECENTRED, riccati,
+                    loop[:n_x] if model.identity else C.dot(loop))
 
 
 def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights,
@@ -153,22 +145,16 @@ def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights,
 
     Arguments and result as in :func:`feedback`.
     """
-    A = _averaged_jacobian(model, x, target, _input_secant(model, x, target))
-    B = model.input_matrix(x)
-    riccati = solve_riccati(A, B, weights.Q, weights.R, **how)
-    return Feedback(target.u - riccati.K @ (x - target.x), Form.AVERAGED, riccati,
-                    A, -B @ riccati.K)
+    A, D = model.averaged_drift_jacobian(x, target.x), _input_secant(model, x, target)
+    riccati = solve_riccati(A if D is None else A + D, model.input_matrix(x), weights.Q,
+                            weights.R, **how)
+    return Feedback(target.u - riccati.K.dot(x - target.x), Form.AVERAGED, riccati, riccati.loop)
 
 
 def _input_secant(model: LiftedModel, x: Array, target: Target) -> Array | None:
     """Return D (n_x, n_x) with (B(x) - B(x_ref)) u_ref = D (x - x_ref); None where it is 0."""
     terms = model.input_terms
     return None if terms is None else terms.averaged_jacobian(x, target.x, target.u)
-
-
-def _averaged_jacobian(model: LiftedModel, x: Array, target: Target, D: Array | None) -> Array:
-    A = model.averaged_drift_jacobian(x, target.x)
-    return A if D is None else A + D
 
 
 class StateDependentRiccati(Law):

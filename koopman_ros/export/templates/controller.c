@@ -475,31 +475,32 @@ static int gain_of(const regulator *r, int held, mat P, mat *K) {
     PA = scaled(held, mul(transposed(r->A), PA));
     right = mul(transposed(right), *K);
     rest = plus(plus(rest, 1.0, PA), -1.0, right);
-    terms += size(PA) + size(right);
+    terms += size(right);
     if (!(size(rest) / terms <= TUNING_MAX_RICCATI_RESIDUAL)) return KOOPMAN_RICCATI_INACCURATE;
     right = scaled(1.0 / TUNING_MAX_GAIN, *K);
     return contracts(mul(right, transposed(right))) ? KOOPMAN_OK : KOOPMAN_GAIN_TOO_LARGE;
 }
 
-/* The gain K (NU, n) of the regulator of x' = A x + B u with inputs that are held for h, or of the
- * continuous one where h is 0. Returns a status. */
-static int riccati(mat A, mat B, double h, mat *K) {
+/* The gain K (NU, n) of the regulator of x' = A x + B u with inputs that are held for h, and the
+ * transition of its loop; of the continuous one, and A - B K, where h is 0. Returns a status. */
+static int riccati(mat A, mat B, double h, mat *K, mat *loop) {
     if (!all_finite(A) || !all_finite(B)) return KOOPMAN_NOT_STABILISABLE;
     regulator r = sampled(A, B, h);
     mat G = mul(r.B, solve(r.R, transposed(r.B))), P = solve(r.R, r.S);
     A = plus_mul(r.A, -1.0, r.B, P);
     P = plus_mul(r.Q, -1.0, transposed(r.S), P);
     if (!(h > 0.0)) discretised(&A, &G, &P, size(r.A) + sqrt(size(G) * size(r.Q)));
-    return doubled(A, G, &P) ? gain_of(&r, h > 0.0, P, K) : KOOPMAN_NOT_STABILISABLE;
+    if (!doubled(A, G, &P)) return KOOPMAN_NOT_STABILISABLE;
+    int status = gain_of(&r, h > 0.0, P, K);
+    *loop = plus_mul(plus(r.A, h > 0.0, diagonal(A.n, 1.0)), -1.0, r.B, *K);
+    return status;
 }
 
-/* Whether e' = slope e - B K e(last sample) decays, or e' = (slope - B K) e where h is 0 */
-static int decays(mat slope, mat B, mat K, double h) {
-    int held = h > 0.0;
-    if (!held) slope = plus_mul(slope, -1.0, B, K);
-    if (!all_finite(slope) || !all_finite(B) || !all_finite(K)) return 0;
-    regulator r = sampled(slope, B, held ? h : 1.0);
-    return contracts(plus_mul(plus(diagonal(NX, 1.0), 1.0, r.A), -held, r.B, K));
+/* Whether an error with this transition decays, or with e' = loop e where h is 0 */
+static int decays(mat loop, double h) {
+    if (!all_finite(loop)) return 0;
+    if (h > 0.0) return contracts(loop);
+    return contracts(plus(diagonal(NX, 1.0), 1.0, sampled(loop, zeros(NX, NU), 1.0).A));
 }
 
 /* --- The control law --- */
@@ -515,8 +516,8 @@ static mat limited(mat u, const double *previous, double seconds) {
 }
 
 /* Of the re-centred law towards y_ref: e = N(x) - N(x_ref), M with e = M (x - x_ref), and loop and
- * push of e' = (A + H C) e + N' B v; returns its slope in terms of x. */
-static mat recentred(mat x, mat y_ref, mat w, mat *loop, mat *push, mat *e, mat *M) {
+ * push of e' = (A + H C) e + N' B v. */
+static void recentred(mat x, mat y_ref, mat w, mat *loop, mat *push, mat *e, mat *M) {
     mat x_ref = state_of(y_ref), u_ref = input_of(y_ref), N, H, J;
     w = plus_mul(w, 1.0, input_matrix(0, x_ref, u_ref, &J), u_ref);
     w = plus_mul(w, -1.0, of(NX, NX, PRE_FEEDBACK), x_ref);
@@ -528,8 +529,6 @@ static mat recentred(mat x, mat y_ref, mat w, mat *loop, mat *push, mat *e, mat 
     *loop = of(NZ, NZ, MODEL_A);
     put(loop, 0, 0, plus(block(*loop, 0, 0, NZ, NX), 1.0, H));
     *push = mul(N, input_matrix(0, x, u_ref, &J));
-    if (READ_OUT) return averaged(x, y_ref);
-    return mul(inverse(N), plus_mul(H, 1.0, of(NZ, NZ, MODEL_A), *M));
 }
 
 /* The law u = u_ref - K e of a model towards a target y_ref = (x_ref, u_ref): a command in its
@@ -539,18 +538,18 @@ static int law(int linear, const koopman_estimate *from, mat y_ref, double inter
     double h = interval / TIME_UNIT;
     int status = KOOPMAN_NOT_STABILISABLE;
     if (CLOSED && !linear) {
-        slope = recentred(x, y_ref, of(NX, 1, from->w), &loop, &push, &e, &M);
-        status = riccati(loop, push, h, &K);
+        recentred(x, y_ref, of(NX, 1, from->w), &loop, &push, &e, &M);
+        status = riccati(loop, push, h, &K, &loop);
     }
-    push = input_matrix(linear, x, input_of(y_ref), &loop);
     if (status != KOOPMAN_OK) {
         if (!linear) slope = averaged(x, y_ref);
+        push = input_matrix(linear, x, input_of(y_ref), &loop);
         M = diagonal(NX, 1.0);
         e = plus(x, -1.0, state_of(y_ref));
-        status = riccati(slope, push, h, &K);
+        status = riccati(slope, push, h, &K, &loop);
     }
     if (status != KOOPMAN_OK) return status;
-    if (!decays(slope, push, mul(K, M), h)) return KOOPMAN_PREDICTED_UNSTABLE;
+    if (!decays(block(mul(loop, M), 0, 0, NX, NX), h)) return KOOPMAN_PREDICTED_UNSTABLE;
     *u = physical_input(plus_mul(input_of(y_ref), -1.0, K, e));
     if (!all_finite(*u)) return KOOPMAN_COMMAND_NOT_FINITE;
     *u = limited(*u, NULL, 0.0);
