@@ -9,9 +9,10 @@ from pathlib import Path
 from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 
+from koopman_ros.nodes import controller
 from koopman_ros.testing import Harness
 from support.controller_bench import Bench, PURE, STATUS, STEADY
-from support.nodes import value
+from support.nodes import complaint, run_here, value
 
 LAWS = """
 from dataclasses import dataclass
@@ -46,8 +47,9 @@ class WithoutCompute(Law):
 
 
 @pytest.fixture
-def own_laws(tmp_path: Path) -> Iterator[Harness]:
+def own_laws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Harness]:
     (tmp_path / 'own_laws.py').write_text(LAWS)
+    monkeypatch.syspath_prepend(tmp_path)
     with Harness(tmp_path, {'PYTHONPATH': str(tmp_path)}) as bench:
         yield bench
 
@@ -72,7 +74,8 @@ def test_a_law_acts_by_its_own_parameters_when_the_one_before_raises(own_laws: H
         DiagnosticStatus.WARN, 'own_laws:Proportional')
 
 
-def test_a_law_without_compute_is_rejected_at_the_start(own_laws: Harness) -> None:
-    process = own_laws.start('controller', {'fallback_order': ['own_laws:WithoutCompute']})
-    assert own_laws.wait_for_end(process) != 0
-    assert 'lacks compute' in process.output()
+@pytest.mark.usefixtures('own_laws')
+def test_a_law_without_compute_is_rejected_at_the_start(
+        capfd: pytest.CaptureFixture[str]) -> None:
+    assert run_here(controller, fallback_order="['own_laws:WithoutCompute']") == 1
+    assert 'lacks compute' in complaint(capfd)
