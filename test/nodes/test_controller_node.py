@@ -8,7 +8,6 @@ import itertools
 import math
 from pathlib import Path
 import re
-import sys
 import time
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -22,9 +21,10 @@ from koopman_ros.core.paths import model_path
 from koopman_ros.demo import reactor
 from koopman_ros.event_log.records import EventRecord, parse, SNAPSHOT
 from koopman_ros.model import load, save
-from koopman_ros.ros import topics
+from koopman_ros.nodes.controller import ControllerNode
+from koopman_ros.ros import signals, topics
 from koopman_ros.testing import Harness
-from support.controller_bench import Bench, reproduced, STATUS, STEADY, until_read
+from support.controller_bench import Bench, reproduced, RunNode, STATUS, STEADY, until_read
 from support.nodes import seconds, temperature, value
 
 
@@ -87,17 +87,13 @@ def test_who_subscribes_is_sent_the_state_twice_where_nothing_happens(bench: Ben
     assert 1 <= second.number - first.number <= 1 + others
 
 
-def test_first_command_waits_for_the_coolant_in_force(ros: Harness) -> None:
+def test_first_command_waits_for_the_coolant_in_force(
+        ros: Harness, run_node: RunNode, monkeypatch: pytest.MonkeyPatch) -> None:
     """Which has another name here."""
     commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
     # patient, or a busy machine could be too slow for it
-    program = ('import sys\n'
-               'from koopman_ros.nodes import controller\n'
-               'from koopman_ros.ros import signals\n'
-               'signals._PATIENCE = 100.0\n'
-               'sys.exit(controller.main())\n')
-    ros.start('controller', arguments=('-r', f'{reactor.COOLANT_TEMPERATURE}:=jacket'),
-              command=(sys.executable, '-c', program))
+    monkeypatch.setattr(signals, '_PATIENCE', 100.0)
+    run_node(ControllerNode, {}, '-r', f'{reactor.COOLANT_TEMPERATURE}:=jacket')
     coolant = ros.speak(Temperature, 'jacket', topics.LATCHED_QOS, to='controller')
     thermometer = ros.speak(Temperature, reactor.TEMPERATURE, to='controller')
     thermometer.publish(temperature(STEADY, 1.0))
@@ -423,10 +419,11 @@ def test_two_controllers_report_each_other_while_both_run(ros: Harness) -> None:
 
 
 def test_a_measured_disturbance_that_fails_is_a_warning_and_the_loop_runs_on(
-        ros: Harness) -> None:
+        ros: Harness, run_node: RunNode) -> None:
     recorded = ros.listen(String, topics.EVENT_LOG)
     bench = Bench(ros, {'model': 'reactor_feed', 'feed_temperature.sensor_max': 120.0,
-                        'feed_temperature.timeout': 5.0, 'stuck_sensor_timeout': 0.0})
+                        'feed_temperature.timeout': 5.0, 'stuck_sensor_timeout': 0.0},
+                  run_node=run_node)
     feed = ros.speak(Temperature, 'feed_temperature', to='controller')
     at = 1.0
     for celsius, words in (
