@@ -388,12 +388,13 @@ def test_a_safe_coolant_outside_the_training_range_is_reported(
         'controller', model='reactor_nz4')).successful
 
 
-def test_two_controllers_report_each_other_while_both_run(ros: Harness) -> None:
+def test_two_controllers_report_each_other_while_both_run(
+        ros: Harness, run_node: RunNode) -> None:
     """Beside a best-effort thermometer, and a coolant that is promised and never told."""
     ros.node.create_publisher(Temperature, reactor.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
     override = ('-p', 'qos_overrides./temperature.subscription.reliability:=best_effort')
     bench = Bench(ros, arguments=override, qos=QoSProfile(
-        depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
+        depth=10, reliability=ReliabilityPolicy.BEST_EFFORT), run_node=run_node)
     assert bench.commands[0].temperature > 25.0
     waited = []
     for k in range(2, 12):

@@ -94,13 +94,13 @@ def start_with_plant(ros: Harness, subscribers: int = 2, **trainer: object) -> l
 
 def test_steps_drive_the_plant_as_planned(ros: Harness) -> None:
     commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
-    given = {'experiment_length': 300.0, 'experiment_seed': 5, 'experiment_min_hold_time': 15.0,
-             'experiment_max_hold_time': 60.0}
+    given = {'experiment_length': 150.0, 'experiment_seed': 5, 'experiment_min_hold_time': 8.0,
+             'experiment_max_hold_time': 30.0}
     measured = start_with_plant(ros, **given)
     status = ros.wait_for_status(STATUS, lambda s: s.message.startswith('finished'))
     assert status.level == DiagnosticStatus.OK
     assert status.message == 'finished; coolant to 18.85 degC, held there'
-    ros.wait_until(lambda: len(commands) > 350)
+    ros.wait_until(lambda: len(commands) > 180)
 
     plan = TABLE.snapshot(given).experiment(SIGNALS)
     # the first ones may have been given before the bench was known

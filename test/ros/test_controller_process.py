@@ -22,6 +22,7 @@ from koopman_ros.core.units import LAST_STAMP_SECONDS
 from koopman_ros.demo import reactor
 from koopman_ros.event_log.records import parse
 from koopman_ros.nodes.controller import ControllerNode
+from koopman_ros.nodes.plant import PlantNode
 from koopman_ros.ros import topics
 from koopman_ros.ros.node import range_of
 from koopman_ros.testing import Harness
@@ -137,7 +138,7 @@ def test_time_may_begin_at_zero_jump_by_an_hour_and_back_and_come_to_its_end(ros
 
 
 def test_missing_simulated_time_is_reported_and_its_silence_leads_to_the_safe_coolant(
-        ros: Harness) -> None:
+        ros: Harness, run_node: RunNode) -> None:
     """The clock goes fifty times faster than the wall's."""
     bench = Bench(ros, {'measurement_timeout': 10.0, 'hold_timeout': 20.0},
                   ('-p', 'use_sim_time:=true'))
@@ -158,7 +159,7 @@ def test_missing_simulated_time_is_reported_and_its_silence_leads_to_the_safe_co
                                    reactor.COOLANT_TEMPERATURE)
                  for part in ('-r', f'{name}:=elsewhere/{name}')]
     clock = ros.listen(Clock, topics.CLOCK, topics.CLOCK_QOS)
-    ros.start('plant', {'speed': 50.0}, tuple(elsewhere))
+    run_node(PlantNode, {'speed': 50.0}, *elsewhere)
     ros.wait_until(lambda: clock)
     last = float(next(times))
     held = bench.measure(STEADY, last).temperature

@@ -73,7 +73,7 @@ class Bench:
         if run_node is None:
             self.process = ros.start('controller', given, arguments)
         else:
-            run_node(ControllerNode, given)
+            run_node(ControllerNode, given, *arguments)
         self.commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
         self.tracked = ros.listen(Temperature, reactor.ACTIVE_SETPOINT, topics.LATCHED_QOS)
         self.thermometer = ros.speak(Temperature, reactor.TEMPERATURE, qos, to='controller')
