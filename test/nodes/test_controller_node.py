@@ -8,7 +8,6 @@ import itertools
 import math
 from pathlib import Path
 import re
-import sys
 import time
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -22,9 +21,10 @@ from koopman_ros.core.paths import model_path
 from koopman_ros.demo import reactor
 from koopman_ros.event_log.records import EventRecord, parse, SNAPSHOT
 from koopman_ros.model import load, save
-from koopman_ros.ros import topics
+from koopman_ros.nodes.controller import ControllerNode
+from koopman_ros.ros import signals, topics
 from koopman_ros.testing import Harness
-from support.controller_bench import Bench, reproduced, STATUS, STEADY, until_read
+from support.controller_bench import Bench, reproduced, RunNode, STATUS, STEADY, until_read
 from support.nodes import seconds, temperature, value
 
 
@@ -87,17 +87,13 @@ def test_who_subscribes_is_sent_the_state_twice_where_nothing_happens(bench: Ben
     assert 1 <= second.number - first.number <= 1 + others
 
 
-def test_first_command_waits_for_the_coolant_in_force(ros: Harness) -> None:
+def test_first_command_waits_for_the_coolant_in_force(
+        ros: Harness, run_node: RunNode, monkeypatch: pytest.MonkeyPatch) -> None:
     """Which has another name here."""
     commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
     # patient, or a busy machine could be too slow for it
-    program = ('import sys\n'
-               'from koopman_ros.nodes import controller\n'
-               'from koopman_ros.ros import signals\n'
-               'signals._PATIENCE = 100.0\n'
-               'sys.exit(controller.main())\n')
-    ros.start('controller', arguments=('-r', f'{reactor.COOLANT_TEMPERATURE}:=jacket'),
-              command=(sys.executable, '-c', program))
+    monkeypatch.setattr(signals, '_PATIENCE', 100.0)
+    run_node(ControllerNode, {}, '-r', f'{reactor.COOLANT_TEMPERATURE}:=jacket')
     coolant = ros.speak(Temperature, 'jacket', topics.LATCHED_QOS, to='controller')
     thermometer = ros.speak(Temperature, reactor.TEMPERATURE, to='controller')
     thermometer.publish(temperature(STEADY, 1.0))
@@ -295,14 +291,10 @@ def test_the_status_has_mode_law_reason_and_figures(bench: Bench) -> None:
     status = bench.status(lambda s: 'old on receipt' in s.message)
     assert status.level == DiagnosticStatus.WARN
     assert 'max_measurement_age allows 1 s' in status.message
-
-    # of the inputs that act until the dead time is over only the last one is known
-    bench.ros.set_parameters('controller', max_measurement_age=0.0, **{
-        'coolant_temperature.dead_time': 25.0})
-    bench.measure(STEADY, last + 5.0)
-    status = bench.status(lambda s: value(s, 'dead time [s]') == '25')
-    assert value(status, 'effect of inputs before the start ends in [s]') == '24'
-    assert value(status, 'dead time change') == 'dead time of coolant_temperature: 0 s -> 25 s'
+    # with stamps near the wall's, a rate limit would last as long on the way back as on the wall
+    bench.ros.set_parameters('controller', observer_bandwidth=0.0, **{
+        'coolant_temperature.rate_limit': 0.0})
+    bench.settle(STEADY, last + 5.0)
 
 
 def test_stamps_that_stand_still_and_a_temperature_outside_the_trained_range_are_reported(
@@ -316,6 +308,14 @@ def test_stamps_that_stand_still_and_a_temperature_outside_the_trained_range_are
     status = bench.status(lambda s: 'outside the trained range' in s.message)
     assert status.level == DiagnosticStatus.WARN
     assert value(status, 'active law') == 'learned law'
+
+
+def test_of_the_inputs_before_a_dead_time_only_the_last_is_known(bench: Bench) -> None:
+    bench.ros.set_parameters('controller', **{'coolant_temperature.dead_time': 25.0})
+    bench.measure(STEADY, 2.0)
+    status = bench.status(lambda s: value(s, 'dead time [s]') == '25')
+    assert value(status, 'effect of inputs before the start ends in [s]') == '24'
+    assert value(status, 'dead time change') == 'dead time of coolant_temperature: 0 s -> 25 s'
 
 
 def test_internals_carry_the_stamp_of_the_measurement(bench: Bench) -> None:
@@ -388,12 +388,13 @@ def test_a_safe_coolant_outside_the_training_range_is_reported(
         'controller', model='reactor_nz4')).successful
 
 
-def test_two_controllers_report_each_other_while_both_run(ros: Harness) -> None:
+def test_two_controllers_report_each_other_while_both_run(
+        ros: Harness, run_node: RunNode) -> None:
     """Beside a best-effort thermometer, and a coolant that is promised and never told."""
     ros.node.create_publisher(Temperature, reactor.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
     override = ('-p', 'qos_overrides./temperature.subscription.reliability:=best_effort')
     bench = Bench(ros, arguments=override, qos=QoSProfile(
-        depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
+        depth=10, reliability=ReliabilityPolicy.BEST_EFFORT), run_node=run_node)
     assert bench.commands[0].temperature > 25.0
     waited = []
     for k in range(2, 12):
@@ -423,10 +424,11 @@ def test_two_controllers_report_each_other_while_both_run(ros: Harness) -> None:
 
 
 def test_a_measured_disturbance_that_fails_is_a_warning_and_the_loop_runs_on(
-        ros: Harness) -> None:
+        ros: Harness, run_node: RunNode) -> None:
     recorded = ros.listen(String, topics.EVENT_LOG)
     bench = Bench(ros, {'model': 'reactor_feed', 'feed_temperature.sensor_max': 120.0,
-                        'feed_temperature.timeout': 5.0, 'stuck_sensor_timeout': 0.0})
+                        'feed_temperature.timeout': 5.0, 'stuck_sensor_timeout': 0.0},
+                  run_node=run_node)
     feed = ros.speak(Temperature, 'feed_temperature', to='controller')
     at = 1.0
     for celsius, words in (

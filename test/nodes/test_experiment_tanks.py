@@ -14,9 +14,11 @@ import pytest
 from sensor_msgs.msg import JointState
 
 from koopman_ros.core.units import NANOSECONDS
+from koopman_ros.nodes.trainer import TrainerNode
 from koopman_ros.ros import topics
 from koopman_ros.ros.time_conversion import stamp_message
 from koopman_ros.testing import Harness
+from support.controller_bench import RunNode
 from support.tanks import LEVELS, linear, PUMPS, TANKS
 
 STATUS, SERVICE = 'trainer: experiment', 'trainer/experiment'
@@ -29,7 +31,7 @@ TRAINER = {
             ('safe_value', SAFE))},
     **{f'{name}.experiment_{end}': bound for name in LEVELS
        for end, bound in (('min', 0.02), ('max', 0.5))}}
-PLANT = {'system': 'two_tanks', 'sample_period': 1.0, 'lockstep': True, 'speed': 0.0}
+PLANT = {'system': 'two_tanks', 'sample_period': 2.0, 'lockstep': True, 'speed': 0.0}
 
 
 def numbers(messages: list[Any]) -> np.ndarray:
@@ -49,8 +51,8 @@ def test_setpoints_step_and_return_to_their_previous_values(ros: Harness, tmp_pa
         f'{name}.weight': 1e4 for name in LEVELS}})
     asked = [ros.speak(JointState, f'{name}/setpoint', to='controller') for name in LEVELS]
     ros.start('trainer', {
-        **TRAINER, 'model': model, 'experiment_signal': 'setpoint', 'experiment_length': 250.0,
-        'experiment_min_hold_time': 20.0, 'experiment_max_hold_time': 50.0, **{
+        **TRAINER, 'model': model, 'experiment_signal': 'setpoint', 'experiment_length': 150.0,
+        'experiment_min_hold_time': 12.0, 'experiment_max_hold_time': 25.0, **{
             f'{name}.setpoint_{end}': float(bound[i]) for i, name in enumerate(LEVELS)
             for end, bound in (('min', low), ('max', high))}})
     ros.meet('trainer')
@@ -61,7 +63,7 @@ def test_setpoints_step_and_return_to_their_previous_values(ros: Harness, tmp_pa
     for name, publisher, level in zip(LEVELS, asked, before, strict=True):
         publisher.publish(JointState(name=[name], position=[float(level)]))
     # no quicker: all of them would work on while something else is waited for
-    ros.start('plant', {**PLANT, 'speed': 100.0, 'lockstep_subscribers': 2})
+    ros.start('plant', {**PLANT, 'speed': 20.0, 'lockstep_subscribers': 2})
     ros.wait_until(lambda: all(heard and heard[-1].position[0] == level
                                for heard, level in zip(active, before, strict=True)))
     for publisher in asked:
@@ -85,7 +87,7 @@ def test_setpoints_step_and_return_to_their_previous_values(ros: Harness, tmp_pa
         assert least <= steps.min() < steps.max() <= most
         # the plant went there
         assert np.ptp(numbers(true[first:last])) > 0.5 * np.ptp(steps)
-    ros.wait_until(lambda: len(measured[0]) > last + 100)
+    ros.wait_until(lambda: len(measured[0]) > last + 30)
     assert [heard[-1].position[0] for heard in measured] == pytest.approx(before, rel=0.02)
 
     # one that the controller rejects
@@ -122,8 +124,8 @@ def test_setpoints_step_and_return_to_their_previous_values(ros: Harness, tmp_pa
 
 
 def test_an_experiment_of_setpoints_without_a_controller_is_rejected(
-        ros: Harness, tmp_path: Path) -> None:
-    ros.start('trainer', {
+        ros: Harness, tmp_path: Path, run_node: RunNode) -> None:
+    run_node(TrainerNode, {
         **TRAINER, 'model': linear(tmp_path), 'experiment_signal': 'setpoint',
         'experiment_timeout': 1.0, **{f'{name}.setpoint_{end}': bound for name in LEVELS
                                       for end, bound in (('min', 0.1), ('max', 0.2))}})

@@ -14,10 +14,11 @@ from sensor_msgs.msg import Temperature
 
 from koopman_ros.core.paths import model_path
 from koopman_ros.demo import reactor
+from koopman_ros.nodes import controller
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, NodeProcess
 from support.controller_bench import STEADY
-from support.nodes import change, seconds, temperature, value
+from support.nodes import change, run_here, seconds, temperature, value
 
 SAFE = 10.0  # degC
 STRIKES = STEADY + 1.0  # degC at which a callback raises, in the controller below
@@ -175,12 +176,13 @@ def test_plants_and_controllers_of_a_site(ros: Harness) -> None:
     assert ros.trigger('/hall_2/a/plant/reset').success
 
 
-def test_process_of_which_no_loop_is_left_ends(ros: Harness, tmp_path: Path) -> None:
-    process = start(ros, 'controller', ('a', 'b'), '-p', 'model:=nowhere.safetensors')
-    process.told_to_end = True
-    assert ros.wait_for_end(process) == 1
-    assert process.output().count('cannot start: no model file at nowhere.safetensors') == 2
-    process = start(ros, 'controller', ('a', 'b'), '-r', '__ns:=/elsewhere')
-    assert ros.wait_for_end(process) == 1
+def test_program_of_which_no_loop_is_left_ends(
+        tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / 'loops.txt').write_text('a\nb')
+    loops = ('--', '--loops', str(tmp_path / 'loops.txt'))
+    assert run_here(controller, *loops, model='nowhere.safetensors') == 1
+    said = capfd.readouterr().err
+    assert said.count('cannot start: no model file at nowhere.safetensors') == 2
+    assert run_here(controller, '-r', '__ns:=/elsewhere', *loops) == 1
     assert 'controller: cannot start: -r __ns:=/elsewhere would apply to all loops' in (
-        process.output())
+        capfd.readouterr().err)

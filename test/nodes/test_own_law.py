@@ -3,15 +3,15 @@
 
 """Laws of one's own in one file, over ROS: one with a parameter, one that raises, one rejected."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 
+from koopman_ros.nodes import controller
 from koopman_ros.testing import Harness
-from support.controller_bench import Bench, PURE, STATUS, STEADY
-from support.nodes import value
+from support.controller_bench import Bench, PURE, RunNode, STATUS, STEADY
+from support.nodes import complaint, run_here, value
 
 LAWS = """
 from dataclasses import dataclass
@@ -45,20 +45,20 @@ class WithoutCompute(Law):
 """
 
 
-@pytest.fixture
-def own_laws(tmp_path: Path) -> Iterator[Harness]:
+@pytest.fixture(autouse=True)
+def own_laws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / 'own_laws.py').write_text(LAWS)
-    with Harness(tmp_path, {'PYTHONPATH': str(tmp_path)}) as bench:
-        yield bench
+    monkeypatch.syspath_prepend(tmp_path)
 
 
-def test_a_law_acts_by_its_own_parameters_when_the_one_before_raises(own_laws: Harness) -> None:
-    bench = Bench(own_laws, {
+def test_a_law_acts_by_its_own_parameters_when_the_one_before_raises(
+        ros: Harness, run_node: RunNode) -> None:
+    bench = Bench(ros, {
         **PURE, 'fallback_order': ['own_laws:Raises', 'own_laws:Proportional', 'linear'],
-        'Proportional.gain': 3.0, 'coolant_temperature.rate_limit': 0.0})
+        'Proportional.gain': 3.0, 'coolant_temperature.rate_limit': 0.0}, run_node=run_node)
     at_rest = bench.measure(STEADY, 2.0).temperature
     assert bench.measure(STEADY + 0.5, 3.0).temperature == pytest.approx(at_rest - 1.5, abs=0.02)
-    set_parameters = own_laws.set_parameters_atomically
+    set_parameters = ros.set_parameters_atomically
     assert set_parameters('controller', **{'Proportional.gain': 1.0}).successful
     assert bench.measure(STEADY + 0.5, 4.0).temperature == pytest.approx(at_rest - 0.5, abs=0.02)
     assert set_parameters('controller', **{
@@ -67,12 +67,12 @@ def test_a_law_acts_by_its_own_parameters_when_the_one_before_raises(own_laws: H
     rejected = set_parameters('controller', **{'Proportional.gain': 51.0})
     assert not rejected.successful
     assert 'Proportional.gain = 51.0' in rejected.reason
-    status = own_laws.wait_for_status(STATUS, lambda s: 'KeyError' in s.message)
+    status = ros.wait_for_status(STATUS, lambda s: 'KeyError' in s.message)
     assert (status.level, value(status, 'active law')) == (
         DiagnosticStatus.WARN, 'own_laws:Proportional')
 
 
-def test_a_law_without_compute_is_rejected_at_the_start(own_laws: Harness) -> None:
-    process = own_laws.start('controller', {'fallback_order': ['own_laws:WithoutCompute']})
-    assert own_laws.wait_for_end(process) != 0
-    assert 'lacks compute' in process.output()
+def test_a_law_without_compute_is_rejected_at_the_start(
+        capfd: pytest.CaptureFixture[str]) -> None:
+    assert run_here(controller, fallback_order="['own_laws:WithoutCompute']") == 1
+    assert 'lacks compute' in complaint(capfd)

@@ -25,6 +25,7 @@ from koopman_ros.testing import Harness
 from koopman_ros.testing.process import NodeProcess
 from support.installation import Installation, ROOT, run, underlay
 from support.nodes import run_here
+from support.quick_retraining import QUICK_TRAINER
 
 OVEN = ROOT / 'examples' / 'oven'
 PAGE = (ROOT / 'docs' / 'tutorials' / 'own_plant.md').read_text()
@@ -64,8 +65,9 @@ def start(ros: Harness, overlay: Installation, command: tuple[str, tuple[str, ..
 
 def train(ros: Harness, overlay: Installation, command: tuple[str, tuple[str, ...]],
           setting: str) -> Any:
-    """Train as the page has it; return the errors of the lift and of the linear model, in K."""
-    process = start(ros, overlay, command, '-p', setting)
+    """Train quickly as the page has it; return the errors of lift and linear model, in K."""
+    process = ros.start('trainer', {}, (*command[1], '-p', setting), overlay.command(
+        str(overlay.python), '-c', QUICK_TRAINER))
     assert ros.wait_for_end(process) == 0, process.output()
     said = re.search(ACCEPTED, process.output())
     assert said, process.output()

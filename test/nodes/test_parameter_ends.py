@@ -3,8 +3,7 @@
 
 """Every parameter of every table at both ends of its range: what is accepted can be used."""
 
-from collections.abc import Callable, Iterator, Mapping
-import contextlib
+from collections.abc import Callable, Mapping
 import itertools
 import math
 import random
@@ -26,7 +25,7 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.node_descriptions import tables
 from koopman_ros.testing import Harness
-from support.nodes import seconds, temperature
+from support.nodes import running, seconds, temperature
 
 TABLES = tables()
 STEADY = 51.8  # degC, near the plant's steady state
@@ -86,22 +85,6 @@ def usable_for_itself(reason: str) -> bool:
         'temperature.weight = 0.0 1/K^2' in reason and ' is not usable: ' in reason)
 
 
-@contextlib.contextmanager
-def running(ros: Harness, create: Callable[..., ManagedNode], **parameters: Any
-            ) -> Iterator[ManagedNode]:
-    """Run a node in the thread of the test, where an error of the node is raised."""
-    given = [part for name, value in parameters.items() for part in (
-        '-p', f'{name}:={str(value).lower() if isinstance(value, bool) else value}')]
-    node = create(context=ros.node.context, cli_args=['--ros-args', *given])
-    try:
-        node.start()
-        ros.node.executor.add_node(node)
-        yield node
-        node.complete()
-    finally:
-        node.destroy_node()
-
-
 def try_each(node: ManagedNode, changes: list[dict[str, Any]], use: Callable[[], object]) -> int:
     """Use a node after each change, which is then taken back; return how many were accepted."""
     def change(values: Mapping[str, Any]) -> SetParametersResult:
@@ -144,7 +127,7 @@ def at_once(draw: random.Random) -> dict[str, Any]:
 
 
 def test_controller_answers_with_each_parameter_and_with_all_at_their_ends(ros: Harness) -> None:
-    with running(ros, ControllerNode) as node:
+    with running(ros, ControllerNode, {}) as node:
         commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
         sensor = ros.speak(Temperature, reactor.TEMPERATURE, to='controller')
         times = itertools.count(1)
@@ -171,7 +154,7 @@ def test_plant_runs_with_every_changeable_parameter_at_its_ends(
         ros: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
     # of a reactor that has become stiff the plant says so, sooner or later
     monkeypatch.setattr(simulation, '_MAX_STEPS_PER_HOLD', 500)
-    with running(ros, PlantNode, speed=0.0, sample_period=0.1) as node:
+    with running(ros, PlantNode, {'speed': 0.0, 'sample_period': 0.1}) as node:
         heard = ros.listen(Temperature, reactor.TEMPERATURE)
         coolant = ros.speak(Temperature, reactor.COOLANT_SETPOINT, to='plant')
 
@@ -188,7 +171,7 @@ def test_plant_runs_with_every_changeable_parameter_at_its_ends(
 
 
 def test_trainer_steps_with_every_parameter_of_the_experiment_at_its_ends(ros: Harness) -> None:
-    with running(ros, TrainerNode, record_at_start=False) as node:
+    with running(ros, TrainerNode, {'record_at_start': False}) as node:
         commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
         sensor = ros.node.create_publisher(Temperature, reactor.TEMPERATURE, topics.LOOP_QOS)
         client = ros.node.create_client(SetBool, 'trainer/experiment')
@@ -211,7 +194,7 @@ def test_trainer_steps_with_every_parameter_of_the_experiment_at_its_ends(ros: H
 
 
 def test_trainer_rejects_names_that_cannot_be_topics(ros: Harness) -> None:
-    with running(ros, TrainerNode, record_at_start=False) as node:
+    with running(ros, TrainerNode, {'record_at_start': False}) as node:
         for name, words in (('{nobody}', 'unknown substitution'),
                             ('a//b', 'topic name must not contain'),
                             ('x' * 5000, 'topic length should not exceed')):
@@ -221,5 +204,6 @@ def test_trainer_rejects_names_that_cannot_be_topics(ros: Harness) -> None:
             assert len(result.reason.splitlines()) == 1
             assert len(result.reason) < 250
     with (pytest.raises(ConfigurationError, match='unknown substitution'),
-          running(ros, TrainerNode, record_at_start=False, topics="['{nobody}']")):
+          running(ros, TrainerNode, {
+              'record_at_start': False, 'topics': "['{nobody}']"})):
         pass

@@ -26,6 +26,7 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.simulated_plant import Analyser
 from koopman_ros.ros.time_conversion import stamp_nanoseconds
 from koopman_ros.testing import Harness
+from support.controller_bench import RunNode
 from support.nodes import seconds, temperature, value
 
 STATUS = 'plant: simulation'
@@ -37,8 +38,8 @@ TABLE = PlantTable()
 class Bench:
     """A lock-step plant whose every measurement the test answers with a coolant."""
 
-    def __init__(self, ros: Harness, before: Callable[[], object] = lambda: None,
-                 **parameters: object) -> None:
+    def __init__(self, ros: Harness, run_node: Callable[..., object],
+                 before: Callable[[], object] = lambda: None, **parameters: object) -> None:
         self.ros = ros
         self.coolant = NOMINAL_COOLANT
         self.answering = True
@@ -47,8 +48,8 @@ class Bench:
         self.sent_ns: list[int] = []  # when each was measured
         ros.node.create_subscription(
             Temperature, reactor.TEMPERATURE, self._on_measurement, topics.LOOP_QOS)
-        self.process = ros.start(
-            'plant', {'lockstep': True, 'speed': 0.0, 'lockstep_timeout': 3600.0, **parameters})
+        run_node(PlantNode, {
+            'lockstep': True, 'speed': 0.0, 'lockstep_timeout': 3600.0, **parameters})
         before()
         self._commands = ros.node.create_publisher(
             Temperature, reactor.COOLANT_SETPOINT, topics.LOOP_QOS)
@@ -103,7 +104,8 @@ class Bench:
 @pytest.fixture(scope='module')
 def shared_bench(shared_ros: Harness) -> Bench:
     # no quicker: it works on while something else is waited for
-    return Bench(shared_ros, seed=SEED, speed=100.0)
+    return Bench(shared_ros, lambda _, parameters: shared_ros.start('plant', parameters),
+                 seed=SEED, speed=100.0)
 
 
 @pytest.fixture
@@ -141,17 +143,16 @@ def test_sensor_is_noisy_biased_and_coarse_as_it_is_set_while_it_runs(bench: Ben
 
 
 def test_real_time_stamps_are_the_wall_clock_and_silence_is_reported_while_it_lasts(
-        ros: Harness) -> None:
+        ros: Harness, run_node: RunNode, capfd: pytest.CaptureFixture[str]) -> None:
     """Of a plant, here, that has no steady state to start from."""
     heard = ros.listen(Temperature, reactor.TEMPERATURE)
-    process = ros.start('plant', {
-        'sample_period': 0.1, 'constants.heat_transfer_coefficient': 0.0})
+    run_node(PlantNode, {'sample_period': 0.1, 'constants.heat_transfer_coefficient': 0.0})
     ros.wait_until(lambda: len(heard) >= 5)
     # the clock last, since further messages arrive meanwhile
     stamps = [stamp_nanoseconds(message.header.stamp) for message in heard]
     now = time.time_ns()
     assert heard[0].temperature == pytest.approx(51.7, abs=1.0)
-    assert 'the plant starts at' in process.output()
+    assert 'the plant starts at' in capfd.readouterr().err
     assert 0 <= now - stamps[-1] < 5_000_000_000
     assert all((late - early) % 100_000_000 == 0 and late > early
                for early, late in pairwise(stamps))
@@ -169,14 +170,15 @@ def test_real_time_stamps_are_the_wall_clock_and_silence_is_reported_while_it_la
         value(s, 'coolant command [degC]')) == pytest.approx(26.0))
 
 
-def test_lockstep_waits_for_a_controller_and_is_paced(ros: Harness) -> None:
+def test_lockstep_waits_for_a_controller_and_is_paced(ros: Harness, run_node: RunNode) -> None:
     """Of the two-state reactor, which stays at its steady state."""
     def wait() -> None:
         status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.WARN)
         assert status.message == 'waiting for a controller or trainer to subscribe'
 
     concentrations = ros.listen(JointState, reactor.CONCENTRATION)
-    bench = Bench(ros, wait, system='two_state', speed=20.0, sample_period=0.5, start_time=7.0)
+    bench = Bench(ros, run_node, wait, system='two_state', speed=20.0, sample_period=0.5,
+                  start_time=7.0)
     measured = bench.wait_for_more(21)
     assert [seconds(message) for message in measured] == [7.0 + 0.5 * k for k in range(21)]
     assert [message.temperature for message in measured] == pytest.approx(
@@ -209,8 +211,9 @@ def test_a_valve_of_equal_percentage_needs_its_range() -> None:
         table.snapshot({}), **{'valve.max': 1e9}))
 
 
-def test_reset_returns_to_the_start_until_the_duration_is_over(ros: Harness) -> None:
-    bench = Bench(ros, start_time=10.0, duration=210.0, sample_period=0.7,
+def test_reset_returns_to_the_start_until_the_duration_is_over(
+        ros: Harness, run_node: RunNode) -> None:
+    bench = Bench(ros, run_node, start_time=10.0, duration=210.0, sample_period=0.7,
                   **{'temperature.initial_offset': -5.0})
     initial = bench.wait_for_more(1)[0].temperature
     bench.wait_for(lambda celsius: celsius > initial + 1.0)
@@ -220,15 +223,14 @@ def test_reset_returns_to_the_start_until_the_duration_is_over(ros: Harness) -> 
     bench.resume()
     assert bench.wait_for_more(1)[0].temperature == pytest.approx(initial, abs=0.5)
     bench.status(lambda s: s.message == 'finished: simulated duration reached')
-    ros.wait_until(lambda: 'finished: simulated duration' in bench.process.output())
     ros.wait_until(lambda: len(bench.measured) >= 301)
     assert [seconds(message) for message in bench.measured] == pytest.approx(
         [10.0 + 0.7 * k for k in range(301)], abs=1e-9)
     assert not ros.trigger('plant/reset').success
 
 
-def test_replay_stops_at_the_last_stamp(ros: Harness) -> None:
-    bench = Bench(ros, start_time=LAST_STAMP_SECONDS - 7.0)
+def test_replay_stops_at_the_last_stamp(ros: Harness, run_node: RunNode) -> None:
+    bench = Bench(ros, run_node, start_time=LAST_STAMP_SECONDS - 7.0)
     status = bench.status(lambda s: s.level == DiagnosticStatus.ERROR)
     assert 'smaller start_time' in status.message
     # all digits

@@ -28,11 +28,12 @@ from koopman_ros.core.units import NANOSECONDS, to_celsius, ZERO_CELSIUS
 from koopman_ros.demo import reactor
 from koopman_ros.event_log.records import MODEL, PARAMETERS
 from koopman_ros.model import load, save
+from koopman_ros.nodes.controller import ControllerNode
 from koopman_ros.plants import Process
-from koopman_ros.ros import topics
+from koopman_ros.ros import model_reload, topics
 from koopman_ros.testing import Harness
 from support.closed_loops import REACTOR
-from support.controller_bench import PATIENT, reproduced, STATUS, STEADY, until_read
+from support.controller_bench import PATIENT, reproduced, RunNode, STATUS, STEADY, until_read
 from support.nodes import change, opened, temperature, value
 
 NAMES = ('reactor_nz3', 'reactor_nz4', 'reactor_linear')
@@ -126,7 +127,7 @@ def test_reloads_under_load_leave_no_trace(ros: Harness, tmp_path: Path) -> None
     status = ros.wait_for_status(STATUS, lambda s: value(s, 'model reloads') == '12')
     assert status.level != DiagnosticStatus.ERROR
     # a busy machine measures less often, and the set-point moves once in 200 measurements
-    ros.wait_until(lambda: len(bench.sent) > 500)
+    ros.wait_until(lambda: len(bench.sent) > 320)
     timer.cancel()
     bench.wait_for_answers()
     assert [message.header.stamp for message in bench.commands] == [
@@ -145,8 +146,8 @@ SHIPPED = load(model_path('reactor_nz4'))
 
 
 def test_rejected_model_leaves_the_old_one_in_force_until_the_operator_forces_it(
-        ros: Harness, tmp_path: Path) -> None:
-    ros.start('controller', PATIENT)
+        ros: Harness, tmp_path: Path, run_node: RunNode) -> None:
+    run_node(ControllerNode, PATIENT)
     bench, file = Bench(ros), tmp_path / 'rejected.safetensors'
 
     def measure() -> float:
@@ -197,11 +198,11 @@ def test_rejected_model_leaves_the_old_one_in_force_until_the_operator_forces_it
 
 
 def test_a_model_that_predicts_recent_measurements_much_worse_is_rejected(
-        ros: Harness, tmp_path: Path) -> None:
+        ros: Harness, tmp_path: Path, run_node: RunNode) -> None:
     """It takes over neither by parameter nor by service, unless the operator insists."""
     file = tmp_path / 'model.safetensors'
     put(model_path('reactor_nz4').read_bytes(), file)
-    ros.start('controller', {'model': file, 'bumpless_transfer_time': 0.0, **PATIENT})
+    run_node(ControllerNode, {'model': file, 'bumpless_transfer_time': 0.0, **PATIENT})
     bench = Bench(ros)
     bench.period = 5.0
     setpoint = ros.speak(Temperature, reactor.SETPOINT, to='controller')
@@ -325,8 +326,13 @@ def test_the_loop_continues_while_a_slow_disk_is_read(ros: Harness, tmp_path: Pa
 
 
 def test_a_slow_trial_serves_the_next_attempt_unless_the_file_has_changed(
-        ros: Harness, tmp_path: Path) -> None:
-    bench, file = start_controller(ros, tmp_path, 'model_reload._SHORT_WAIT = 0.0')
+        ros: Harness, tmp_path: Path, run_node: RunNode, monkeypatch: pytest.MonkeyPatch,
+        capfd: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(model_reload, '_SHORT_WAIT', 0.0)
+    file = tmp_path / 'model.safetensors'
+    put(model_path('reactor_nz4').read_bytes(), file)
+    run_node(ControllerNode, {'model': file})
+    bench = Bench(ros)
 
     def accepted(name: str) -> bool:
         return ros.set_parameters('controller', model=name)[0].successful
@@ -338,7 +344,7 @@ def test_a_slow_trial_serves_the_next_attempt_unless_the_file_has_changed(
     assert not accepted(str(file))
     put(model_path('reactor_linear').read_bytes(), file)
     ros.wait_until(lambda: accepted(str(file)))
-    ros.wait_until(lambda: f'model {file}: linear' in ros.printed())
+    ros.wait_until(lambda: f'model {file}: linear' in capfd.readouterr().err)
 
 
 def test_dead_disk_does_not_pile_up_readers(

@@ -282,35 +282,31 @@ def test_run_without_its_start_and_with_a_lost_record_is_reproduced_from_the_sna
     assert 'Records 8 to 8 of run a are missing' in (tmp_path / 'report.md').read_text()
 
 
-def test_a_replay_reports_differences_of_a_new_model_and_a_new_tuning(
+def test_a_replay_reports_differences_of_a_new_tuning_and_none_in_several_bags_of_the_same(
         tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = write_run(tmp_path / 'run.mcap')
-    for new, tuning in (
-            ('reactor_nz4', ('-p', 'coolant_temperature.weight:=5.0')), ('reactor_nz4', ())):
+    for file, tuning, bags, pictures in (
+            ('controller.yaml', ('-p', 'coolant_temperature.weight:=5.0'), [path], {'replay.png'}),
+            ('replay.yaml', (), [path, path], {'replay_1.png', 'replay_2.png'})):
+        output = tmp_path / file
         assert run_here(
-            replay, '--params-file', str(config_directory() / 'controller.yaml'), *tuning,
-            bags=f'[{path}]', new_model=new, output=tmp_path / 'out') == 0
+            replay, '--params-file', str(config_directory() / file), *tuning,
+            '-p', f'bags:=[{", ".join(map(str, bags))}]', '-p', 'new_model:=reactor_nz4',
+            '-p', f'output:={output}') == 0
         assert 'commands are reproduced' in capfd.readouterr().out
-        (figures,) = json.loads((tmp_path / 'out' / 'summary.json').read_text())['bags']
-        assert figures['recorded_model']['identical'] == figures['recorded_model']['compared']
-        found = figures['new_model']
-        same = new == 'reactor_nz4' and not tuning
-        assert (found['beyond_tolerance'] == 0) is same
-        report = (tmp_path / 'out' / 'report.md').read_text()
-        assert same or (
-            f'{found["beyond_tolerance"]} of {found["compared"]} commands differ' in report)
+        found = json.loads((output / 'summary.json').read_text())['bags']
+        assert len(found) == len(bags)
+        report = (output / 'report.md').read_text()
+        for figures in found:
+            assert figures['recorded_model']['identical'] == figures['recorded_model']['compared']
+            new = figures['new_model']
+            assert (new['beyond_tolerance'] > 0) is bool(tuning)
+            assert not tuning or (
+                f'{new["beyond_tolerance"]} of {new["compared"]} commands differ' in report)
         assert 'not a closed loop' in report
-    assert (tmp_path / 'out' / 'replay.png').read_bytes().startswith(b'\x89PNG')
-
-
-def test_several_bags_and_the_shipped_parameter_file(tmp_path: Path) -> None:
-    bag = write_run(tmp_path / 'run.mcap')
-    output = tmp_path / 'out'
-    assert run_here(replay, '--params-file', str(config_directory() / 'replay.yaml'),
-                    '-p', f'bags:=[{bag}, {bag}]', '-p', f'output:={output}') == 0
-    assert {path.name for path in output.iterdir()} == {
-        'report.md', 'summary.json', 'replay_1.png', 'replay_2.png'}
-    assert len(json.loads((output / 'summary.json').read_text())['bags']) == 2
+        assert {path.name for path in output.iterdir()} == {
+            'report.md', 'summary.json', *pictures}
+        assert all((output / name).read_bytes().startswith(b'\x89PNG') for name in pictures)
 
 
 @pytest.mark.parametrize(('arguments', 'words'), [

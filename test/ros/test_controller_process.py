@@ -21,10 +21,12 @@ from std_srvs.srv import Trigger
 from koopman_ros.core.units import LAST_STAMP_SECONDS
 from koopman_ros.demo import reactor
 from koopman_ros.event_log.records import parse
+from koopman_ros.nodes.controller import ControllerNode
+from koopman_ros.nodes.plant import PlantNode
 from koopman_ros.ros import topics
 from koopman_ros.ros.node import range_of
 from koopman_ros.testing import Harness
-from support.controller_bench import Bench, reproduced, STATUS, STEADY, TABLE
+from support.controller_bench import Bench, reproduced, RunNode, STATUS, STEADY, TABLE
 from support.nodes import seconds, temperature, value
 
 CONTROLLER = '/controller'
@@ -136,7 +138,7 @@ def test_time_may_begin_at_zero_jump_by_an_hour_and_back_and_come_to_its_end(ros
 
 
 def test_missing_simulated_time_is_reported_and_its_silence_leads_to_the_safe_coolant(
-        ros: Harness) -> None:
+        ros: Harness, run_node: RunNode) -> None:
     """The clock goes fifty times faster than the wall's."""
     bench = Bench(ros, {'measurement_timeout': 10.0, 'hold_timeout': 20.0},
                   ('-p', 'use_sim_time:=true'))
@@ -157,7 +159,7 @@ def test_missing_simulated_time_is_reported_and_its_silence_leads_to_the_safe_co
                                    reactor.COOLANT_TEMPERATURE)
                  for part in ('-r', f'{name}:=elsewhere/{name}')]
     clock = ros.listen(Clock, topics.CLOCK, topics.CLOCK_QOS)
-    ros.start('plant', {'speed': 50.0}, tuple(elsewhere))
+    run_node(PlantNode, {'speed': 50.0}, *elsewhere)
     ros.wait_until(lambda: clock)
     last = float(next(times))
     held = bench.measure(STEADY, last).temperature
@@ -261,10 +263,12 @@ def test_a_latched_safe_state_outlasts_silence_and_restart_until_it_is_cleared(
     ros.wait_until(lambda: not [*tmp_path.rglob('*.latched')])
 
 
-def test_the_quality_of_a_measurement_is_taken_into_account_and_recorded(ros: Harness) -> None:
+def test_the_quality_of_a_measurement_is_taken_into_account_and_recorded(
+        ros: Harness, run_node: RunNode) -> None:
     records = ros.listen(String, topics.EVENT_LOG)
-    bench = Bench(ros, {'temperature.quality_topic': 'temperature_quality', 'temperature'
-                        '.quality_type': 'diagnostic_msgs/msg/DiagnosticStatus'})
+    bench = Bench(ros, {
+        'temperature.quality_topic': 'temperature_quality',
+        'temperature.quality_type': 'diagnostic_msgs/msg/DiagnosticStatus'}, run_node=run_node)
     quality = ros.speak(DiagnosticStatus, 'temperature_quality', to='controller')
     for time, level, severity, words in (
             (2.0, DiagnosticStatus.ERROR, DiagnosticStatus.ERROR, 'temperature is bad'),
@@ -279,8 +283,9 @@ def test_the_quality_of_a_measurement_is_taken_into_account_and_recorded(ros: Ha
             if record.event == 'measurement'][-3:] == [[2], [1], None]
 
 
-def test_a_loop_runs_on_its_own_clock_with_a_sensor_that_reports_on_change(ros: Harness) -> None:
-    ros.start('controller', {
+def test_a_loop_runs_on_its_own_clock_with_a_sensor_that_reports_on_change(
+        ros: Harness, run_node: RunNode) -> None:
+    run_node(ControllerNode, {
         'temperature.report_on_change': 60.0, 'temperature.deadband': 0.2, 'sample_time': 0.5,
         'measurement_timeout': 5.0, 'coolant_temperature.rate_limit': 0.0, 'use_sim_time': True})
     commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
@@ -322,8 +327,8 @@ def test_a_loop_runs_on_its_own_clock_with_a_sensor_that_reports_on_change(ros: 
 
 
 def test_a_signal_reported_on_change_is_in_each_measurement_and_a_late_one_in_the_estimate(
-        ros: Harness) -> None:
-    ros.start('controller', {
+        ros: Harness, run_node: RunNode) -> None:
+    run_node(ControllerNode, {
         'system': 'two_tanks', 'level_1.report_on_change': 100.0,
         'estimator': 'extended_kalman_filter', 'level_2.analysis_topic': 'laboratory',
         'level_2.analysis_delay': 60.0})

@@ -6,7 +6,6 @@
 from collections.abc import Callable, Iterator
 from pathlib import Path
 import re
-from typing import Any
 from xml.etree import ElementTree
 
 import pytest
@@ -23,6 +22,9 @@ from std_srvs.srv import SetBool
 from koopman_ros.core.paths import config_directory
 from koopman_ros.demo import reactor
 from koopman_ros.nodes import replay
+from koopman_ros.nodes.controller import ControllerNode
+from koopman_ros.nodes.plant import PlantNode
+from koopman_ros.nodes.trainer import TrainerNode
 from koopman_ros.parameters.player import player_table
 from koopman_ros.parameters.trainer import COMMAND, MANUAL, SETPOINT
 from koopman_ros.records import BagWriter, message_definition
@@ -31,6 +33,7 @@ from koopman_ros.ros.hosted import HostedNode
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.node_descriptions import OPERATOR, policy, Program, PROGRAMS, programs
 from koopman_ros.testing import Harness
+from support.controller_bench import RunNode
 from support.nodes import temperature
 
 Seen = dict[str, set[str]]
@@ -74,34 +77,33 @@ def check(ros: Harness, node: str, seen: Seen, system: str = 'reactor') -> None:
     assert seen == granted
 
 
-@pytest.mark.parametrize(('node', 'parameters', 'system'), [
-    ('plant', {'system': 'two_state', 'speed': 2.0}, 'reactor'),
-    ('controller', {'use_sim_time': True}, 'two_tanks'),
-    ('player', {'rate': 0.0, 'clock': True}, 'reactor')])
-def test_a_node_uses_exactly_the_names_that_its_policy_grants(
-        ros: Harness, tmp_path: Path, node: str, parameters: dict[str, Any], system: str) -> None:
-    arguments: tuple[str, ...] = ()
-    if node == 'player':
-        parameters = {**parameters, 'bag': tmp_path / 'all.mcap'}
-        with BagWriter(parameters['bag']) as writer:
-            for number, name in enumerate(player_table().snapshot({}).topics):
-                writer.add_topic(f'/{name}', message_definition('sensor_msgs/msg/Temperature'), ())
-                writer.write(f'/{name}', serialize_message(temperature(40.0, 1.0)), number)
-    if system != 'reactor':
-        # the file of the whole loop
-        arguments = ('--params-file', str(config_directory() / 'plants' / f'{system}.yaml'))
-    process = ros.start(node, parameters, arguments)
-    check(ros, node, {}, system)
-    assert 'ignored' not in process.output()
+def test_nodes_use_exactly_the_names_that_their_policy_grants(
+        ros: Harness, tmp_path: Path, run_node: RunNode, capfd: pytest.CaptureFixture[str]
+        ) -> None:
+    run_node(PlantNode, {'system': 'two_state', 'speed': 2.0})
+    check(ros, 'plant', {})
+    # by the file of the whole loop
+    run_node(ControllerNode, {'use_sim_time': True}, '--params-file',
+             str(config_directory() / 'plants' / 'two_tanks.yaml'))
+    check(ros, 'controller', {}, 'two_tanks')
+    assert 'ignored' not in capfd.readouterr().err
+    bag = tmp_path / 'all.mcap'
+    with BagWriter(bag) as writer:
+        for number, name in enumerate(player_table().snapshot({}).topics):
+            writer.add_topic(f'/{name}', message_definition('sensor_msgs/msg/Temperature'), ())
+            writer.write(f'/{name}', serialize_message(temperature(40.0, 1.0)), number)
+    player = ros.start('player', {'rate': 0.0, 'clock': True, 'bag': bag})
+    check(ros, 'player', {})
+    assert 'ignored' not in player.output()
 
 
 def test_the_trainer_uses_exactly_its_granted_topics_and_services(
-        ros: Harness, tmp_path: Path) -> None:
+        ros: Harness, tmp_path: Path, run_node: RunNode) -> None:
     seen: Seen = {}
     # what is not measured is recorded where it is published
     ros.node.create_publisher(JointState, reactor.CONCENTRATION, topics.LOOP_QOS)
-    ros.start('trainer', {'use_sim_time': True, 'output': tmp_path / 'run.mcap',
-                          'experiment_timeout': 0.5})
+    run_node(TrainerNode, {'use_sim_time': True, 'output': tmp_path / 'run.mcap',
+                           'experiment_timeout': 0.5})
     client = ros.node.create_client(SetBool, '/trainer/experiment')
     ros.wait_until(client.service_is_ready)
     for on, topic in ((COMMAND, reactor.COOLANT_SETPOINT),

@@ -20,11 +20,14 @@ from koopman_ros.demo import reactor
 from koopman_ros.event_log.records import EventRecord, parse
 from koopman_ros.event_log.run import replay_records
 from koopman_ros.model import load
+from koopman_ros.nodes.controller import ControllerNode
 from koopman_ros.parameters.controller import table_of
 from koopman_ros.ros import topics
+from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.testing import Harness
 from support.nodes import seconds, temperature, TIMEOUT, value
 
+RunNode = Callable[..., ManagedNode]
 STATUS = 'controller: control'
 TABLE = table_of(load(model_path(reactor.MODEL)))
 STEADY = 51.8  # degC, near the plant's steady state
@@ -55,14 +58,22 @@ def until_read(change: Callable[[], SetParametersResult]) -> SetParametersResult
 
 
 class Bench:
-    """A controller with a thermometer, which measures once at a first time, and an operator."""
+    """
+    A controller with a thermometer, which measures once at a first time, and an operator.
+
+    It is a process, or a node in the thread of the test where `run_node` is given.
+    """
 
     def __init__(self, ros: Harness, parameters: Mapping[str, object] | None = None,
                  arguments: tuple[str, ...] = (), qos: QoSProfile = topics.LOOP_QOS,
-                 first: float = 1.0) -> None:
+                 first: float = 1.0, run_node: RunNode | None = None) -> None:
         self.ros = ros
         self.sent = 0  # measurements
-        self.process = ros.start('controller', {**PATIENT, **(parameters or {})}, arguments)
+        given = {**PATIENT, **(parameters or {})}
+        if run_node is None:
+            self.process = ros.start('controller', given, arguments)
+        else:
+            run_node(ControllerNode, given, *arguments)
         self.commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
         self.tracked = ros.listen(Temperature, reactor.ACTIVE_SETPOINT, topics.LATCHED_QOS)
         self.thermometer = ros.speak(Temperature, reactor.TEMPERATURE, qos, to='controller')

@@ -3,7 +3,8 @@
 
 """Of tests with nodes: fixtures, messages and statuses, programs and processes, pipes."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
+import contextlib
 import errno
 import gc
 import os
@@ -21,6 +22,7 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.core.units import NANOSECONDS
+from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.time_conversion import stamp_message, stamp_nanoseconds
 from koopman_ros.testing import Harness, isolated_domain
 
@@ -62,6 +64,29 @@ def shared_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Harness]:
     folder = tmp_path_factory.mktemp('shared')
     with Harness(folder) as bench:
         yield bench
+
+
+@contextlib.contextmanager
+def running(ros: Harness, create: Callable[..., ManagedNode], parameters: Mapping[str, object],
+            *arguments: str) -> Iterator[ManagedNode]:
+    """Run a node in the thread of the test, where an error of the node is raised."""
+    given = [part for name, value in parameters.items() for part in (
+        '-p', f'{name}:={str(value).lower() if isinstance(value, bool) else value}')]
+    node = create(context=ros.node.context, cli_args=['--ros-args', *given, *arguments])
+    try:
+        node.start()
+        ros.node.executor.add_node(node)
+        yield node
+        node.complete()
+    finally:
+        node.destroy_node()
+
+
+@pytest.fixture
+def run_node(ros: Harness) -> Iterator[Callable[..., ManagedNode]]:
+    """Yield a function that runs a node in the thread of the test, until the end."""
+    with contextlib.ExitStack() as stack:
+        yield lambda *given: stack.enter_context(running(ros, *given))
 
 
 def change(ros: Harness, node: str, label: str = '', number: int = 0) -> bool:

@@ -6,6 +6,7 @@
 from collections.abc import Iterator
 import contextlib
 from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -39,3 +40,22 @@ def quick_retraining(loops: int, degrees: tuple[int, ...] = (1, 3),
 def page_of(retrained: pipeline.Retrained) -> str:
     """Return what the page of a retraining says; its picture takes half a second to draw."""
     return '\n\n'.join(map(str, _sections(retrained)))
+
+
+_CHILD = f"""
+import sys
+sys.path.insert(0, {str(Path(__file__).parents[1])!r})
+from koopman_ros.learning import report, training_process
+from support.quick_retraining import quick_retraining
+report._draw = lambda *_: False
+with quick_retraining(8):
+    sys.exit(training_process.main())
+"""
+# program of a trainer whose trainings, each in its process, are quick and draw no pictures
+QUICK_TRAINER = f"""
+import sys
+from koopman_ros.execution.training import TrainingJob
+from koopman_ros.nodes import trainer
+TrainingJob.command = lambda *_: (sys.executable, '-c', {_CHILD!r})
+sys.exit(trainer.main())
+"""
