@@ -3,6 +3,8 @@
 
 """Learning from files on the command line."""
 
+from contextlib import redirect_stdout
+import io
 import json
 import os
 from pathlib import Path
@@ -33,7 +35,9 @@ def table(seed, late=0):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
+    """Change to a folder with two records; reports have no pictures."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr('koopman_ros.learning.report._draw', lambda *_: False)
     table(0).to_csv('day.csv', index=False)
     table(1).to_csv('other.csv', index=False)
     return tmp_path
@@ -45,9 +49,20 @@ def learned(*arguments):
                            'linear', *arguments])
 
 
-def test_a_file_is_learned_tested_and_reported(folder, capsys):
-    assert learned('--test', 'other.csv') == 0
-    printed = capsys.readouterr().out
+@pytest.fixture(scope='module')
+def day(tmp_path_factory):
+    """Learn from the first record and test on the second; return the folder and the output."""
+    folder = tmp_path_factory.mktemp('day')
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as printed:
+        patch.chdir(folder)
+        table(0).to_csv('day.csv', index=False)
+        table(1).to_csv('other.csv', index=False)
+        assert learned('--test', 'other.csv') == 0
+    return folder, printed.getvalue()
+
+
+def test_a_file_is_learned_tested_and_reported(day):
+    folder, printed = day
     assert [words in printed for words in (
         'level [m], pump [V]', '600 of 600 measurements used', 'the new model (linear) is acc',
         'test: free run of 600 measurements')] == [True] * 4
@@ -110,11 +125,11 @@ def test_a_measured_disturbance_is_learned_and_keeps_its_role(folder, capsys):
     assert 'rain is 3 in the whole record: leave it out' in capsys.readouterr().err
 
 
-def test_a_present_model_names_the_signals_and_has_to_be_beaten(folder, capsys):
-    assert learned('--model_output', 'first.safetensors') == 0
+@pytest.mark.usefixtures('folder')
+def test_a_present_model_names_the_signals_and_has_to_be_beaten(day, capsys):
     with quick_retraining(8, degrees=(1, 2)):
-        assert learn.main(['other.csv', '--model', 'first.safetensors', '--model_class', 'same',
-                           '--training_seed', '1']) == 2
+        assert learn.main(['other.csv', '--model', str(day[0] / 'day.safetensors'),
+                           '--model_class', 'same', '--training_seed', '1']) == 2
     said = capsys.readouterr().out
     assert 'the new model (linear) is rejected' in said
     assert 'is not 10 % below that of the current model' in said
