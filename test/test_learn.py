@@ -19,7 +19,7 @@ from koopman_ros import learn_files as learn
 from koopman_ros.model import load
 from support.quick_retraining import quick_retraining
 
-N, PERIOD = 600, 0.5
+N, PERIOD = 400, 0.5
 
 
 def table(seed, late=0):
@@ -35,16 +35,16 @@ def table(seed, late=0):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """Change to a folder with two records; reports have no pictures."""
+    """Change to a folder with two records; without matplotlib no pictures are drawn."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr('koopman_ros.learning.report._draw', lambda *_: False)
+    monkeypatch.setitem(sys.modules, 'matplotlib.figure', None)
     table(0).to_csv('day.csv', index=False)
     table(1).to_csv('other.csv', index=False)
     return tmp_path
 
 
 def learned(*arguments):
-    with quick_retraining(8, degrees=(1, 2)):
+    with quick_retraining(4, degrees=(1, 2)):
         return learn.main(['day.csv', '--states', 'level', '--inputs', 'pump', '--model_class',
                            'linear', *arguments])
 
@@ -64,8 +64,8 @@ def day(tmp_path_factory):
 def test_a_file_is_learned_tested_and_reported(day):
     folder, printed = day
     assert [words in printed for words in (
-        'level [m], pump [V]', '600 of 600 measurements used', 'the new model (linear) is acc',
-        'test: free run of 600 measurements')] == [True] * 4
+        'level [m], pump [V]', '400 of 400 measurements used', 'the new model (linear) is acc',
+        'test: free run of 400 measurements')] == [True] * 4
     model = load(folder / 'day.safetensors')
     assert (model.states.names, model.inputs.units) == (('level',), ('V',))
     assert model.eigenvalues.real == pytest.approx([-0.2], rel=0.02)
@@ -112,7 +112,7 @@ def test_a_measured_disturbance_is_learned_and_keeps_its_role(folder, capsys):
     assert effect == pytest.approx(0.16, rel=0.02)
     assert model.dead_time == pytest.approx(0.0)
     # the present model says which signal it is, and it takes no other role
-    with quick_retraining(8, degrees=(1, 2)):
+    with quick_retraining(4, degrees=(1, 2)):
         assert learn.main(['day.csv', '--model', 'day.safetensors', '--model_output',
                            'new.safetensors', '--model_class', 'linear', '--states', 'level',
                            '--inputs', 'pump']) == 2
@@ -127,7 +127,7 @@ def test_a_measured_disturbance_is_learned_and_keeps_its_role(folder, capsys):
 
 @pytest.mark.usefixtures('folder')
 def test_a_present_model_names_the_signals_and_has_to_be_beaten(day, capsys):
-    with quick_retraining(8, degrees=(1, 2)):
+    with quick_retraining(4, degrees=(1, 2)):
         assert learn.main(['other.csv', '--model', str(day[0] / 'day.safetensors'),
                            '--model_class', 'same', '--training_seed', '1']) == 2
     said = capsys.readouterr().out

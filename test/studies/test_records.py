@@ -68,7 +68,7 @@ def test_sets_at_hand_are_run_and_stand_in_the_table(
     program = learn_files.main
     monkeypatch.setattr(learn_files, 'main', lambda words: program(
         [*words, '--model_class', 'linear']))
-    with quick_retraining(8, degrees=(1,)):
+    with quick_retraining(4, degrees=(1,)):
         assert study.main(['--records', str(tmp_path), '--output', str(tmp_path), '--seeds', '1',
                            '--scheduler', '', 'tanks', 'hair_dryer']) == 0
     printed = capsys.readouterr()
