@@ -11,6 +11,7 @@ import pytest
 
 from koopman_ros.learning import compare_classes, evaluate_model
 from koopman_ros.learning import pipeline as task_module
+from koopman_ros.learning.identification import identify_with_characteristics, structure_search
 from koopman_ros.learning.report import _sections
 from support.known_plants import methods
 
@@ -21,12 +22,14 @@ def quick_retraining(loops: int, degrees: tuple[int, ...] = (1, 3),
     """Estimate by a few methods alone, and try laws in so many loops."""
     fewer = {'degrees': degrees, 'methods': methods(*windows)}
     with pytest.MonkeyPatch.context() as patch:
-        for original in (task_module.identify_with_characteristics,
-                         task_module.identify_non_affine):
+        for original, *modules in (
+                (identify_with_characteristics, task_module, structure_search),
+                (task_module.identify_non_affine, task_module)):
             def quick(*given, _original=original, **others):
                 return _original(*given, **{**others, **fewer})
 
-            patch.setattr(task_module, original.__name__, quick)
+            for module in modules:
+                patch.setattr(module, original.__name__, quick)
         patch.setattr(task_module, 'compare_classes', partial(compare_classes, loops=loops))
         patch.setattr(task_module, 'evaluate_model', partial(evaluate_model, loops=loops))
         yield
