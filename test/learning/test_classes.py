@@ -171,7 +171,8 @@ def bag(tmp_path_factory):
 
 def task(bag, folder, model_class):
     return TrainingTask((str(bag),), str(folder / 'new.safetensors'), '', STATES, INPUTS,
-                        coordinates=2, starts=1, model_class=model_class)
+                        coordinates=2, starts=1, model_class=model_class,
+                        dead_time={'coolant_temperature': 0.0})
 
 
 @pytest.fixture

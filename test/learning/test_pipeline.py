@@ -55,7 +55,8 @@ def few_methods():
 
 def small(bag, output, present=SHIPPED, **others):
     return TrainingTask((str(bag),), str(output), str(present), STATES, INPUTS, coordinates=2,
-                        starts=1, **{'model_class': 'identity lift', **others})
+                        starts=1, dead_time={'coolant_temperature': 0.0},
+                        **{'model_class': 'identity lift', **others})
 
 
 @pytest.fixture(scope='module')
@@ -318,7 +319,7 @@ def test_first_lift_is_learned_without_a_present_one(bag, tmp_path):
     """Its nominal point is found in the data; B is known here, in 1/s."""
     rate = float(reactor(0.8).B[0, 0]) / 60.0
     retrained = retrain(small(
-        bag, tmp_path / 'first.safetensors', '', plant='jacket',
+        bag, tmp_path / 'first.safetensors', '', plant='jacket', model_class='polynomial',
         input_gain={'temperature': {'coolant_temperature': rate}}))
     assert retrained.reasons == ()
     assert retrained.present is None

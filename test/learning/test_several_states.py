@@ -4,6 +4,7 @@
 """Retraining with two states and two inputs from a bag; the input as measured or as commanded."""
 
 from dataclasses import asdict, replace
+from functools import partial
 import importlib
 import json
 import warnings
@@ -36,7 +37,7 @@ STATES = tuple(RecordedState(name, 'm', MessageField('/tanks', JOINTS, f'positio
                for name in ('level_2', 'level_1'))
 INPUTS = tuple(RecordedInput(name, 'V', MessageField('/pumps', ARRAY, f'data[{k}]', 'mV'))
                for k, name in ((1, 'pump_2'), (0, 'pump_1')))
-FEWER = {'highest_degree': 2, 'dead_times': False}  # drifts that are tried
+PROMPT = dict.fromkeys(TANKS.input_names, 0.0)  # dead times, in s
 
 
 def write_tanks(path, seconds=500.0):
@@ -83,7 +84,8 @@ def retrained(bag, tmp_path_factory):
     with quick_retraining(8):
         return retrain(TrainingTask((str(bag),), str(folder / 'new.safetensors'),
                                     str(folder / 'present.safetensors'), STATES, INPUTS,
-                                    coordinates=3, starts=1, model_class='identity lift'))
+                                    coordinates=3, starts=1, model_class='identity lift',
+                                    dead_time=PROMPT))
 
 
 def test_lift_of_two_states_and_two_inputs_is_accepted(retrained):
@@ -174,12 +176,12 @@ def test_a_measured_input_replaces_the_command(lagging, measured):
 
 def test_a_level_that_is_in_no_bag_is_learned_with_the_other(bag, tmp_path, monkeypatch):
     """Tank 1 flows into tank 2, so that what it holds shows there."""
-    monkeypatch.setattr(task_module, 'identify_unmeasured', lambda *given, **others:
-                        identify_unmeasured(*given, **{**others, **FEWER}))
+    monkeypatch.setattr(task_module, 'identify_unmeasured', partial(
+        identify_unmeasured, highest_degree=2))
     with quick_retraining(4):
         found = retrain(TrainingTask((str(bag),), str(tmp_path / 'new.safetensors'), '',
                                      STATES[:1], INPUTS, model_class='polynomial',
-                                     unmeasured_states=1))
+                                     unmeasured_states=1, dead_time=PROMPT))
     assert found.reasons == ()
     assert not any('hidden_1' in warning for warning in found.decision.warnings)
     model = load(found.model_file)
@@ -200,7 +202,8 @@ def by_equations(bag, tmp_path_factory):
     folder = tmp_path_factory.mktemp('physical_model')
     task = TrainingTask((str(bag),), str(folder / 'new.safetensors'), '', STATES[:1], INPUTS,
                         model_class='polynomial', physical_model='two_tanks',
-                        constants={'orifice_1': (1e-6, 5e-5), 'pump_gain': None})
+                        constants={'orifice_1': (1e-6, 5e-5), 'pump_gain': None},
+                        dead_time=PROMPT)
     # as the process that retrains is given it
     with quick_retraining(4):
         return retrain(TrainingTask.of(json.loads(json.dumps(asdict(task)))))

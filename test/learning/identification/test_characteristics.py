@@ -71,12 +71,10 @@ def test_a_smoothed_characteristic_rises_with_the_slope_of_the_true_one(g, exact
 
 
 @pytest.mark.parametrize(('g', 'low', 'high'), [
-    (lambda u: np.tanh(2.0 * u), -1.0, 1.0),
     (lambda u: u * u, 0.0, 1.0),
-    (lambda u: 30.0 ** (u - 1.0), 0.0, 1.0),
     (lambda u: np.sign(u) * np.maximum(np.abs(u) - 0.2, 0.0), -1.0, 1.0),
     (lambda u: -np.clip(u, -0.6, 0.6), -1.0, 1.0)],
-    ids=['tanh', 'square', 'equal percentage', 'dead zone', 'reverse, saturated'])
+    ids=['square', 'dead zone', 'reverse, saturated'])
 def test_a_characteristic_is_found(g, low, high):
     found = identified(record(lambda x, u: -x + g(u), low, high))
     one = found.drift.box.inputs.characteristics['valve']
