@@ -90,7 +90,7 @@ design = RandomStepDesign(
 samples = box_episodes(beam, design, episodes=60, duration=0.05, seed=1, starts=(-corner, corner))
 recipes = {'neural drift': NeuralDrift(8, max_iterations=100),
            'identity lift': IncrementalTraining(3, hidden_first=8, max_iterations=40)}
-found = compare(describe(beam), samples, recipes, starts=1, loops=16)
+found = compare(describe(beam), samples, recipes, starts=1, loops=8)
 print(found)
 
 # %% [markdown]

@@ -82,7 +82,7 @@ found = compare(describe(system), samples, {
     'neural drift': NeuralDrift(12, max_iterations=150),
     'identity lift': IncrementalTraining(4, hidden_first=8, max_iterations=40),
     'free lift': IncrementalTraining(2, identity=False, hidden_first=8, max_iterations=40)},
-    starts=1, loops=16)
+    starts=1, loops=8)
 print(found)
 
 # %% [markdown]
@@ -127,7 +127,7 @@ for one in found.contenders:
 model = found.model
 print(f'10 N m: {found.chosen.law_check}; cost relative to a linear law, median '
       f'{found.chosen.law_check.median_ratio:.3f}')
-checks = {torque: evaluate_closed_loops(model, system.derivative, loops=32, limits=InputLimits(
+checks = {torque: evaluate_closed_loops(model, system.derivative, loops=16, limits=InputLimits(
     lower=np.array([-torque]), upper=np.array([torque]), rate=np.array([np.inf])))
     for torque in (4.0, 2.0)}
 for torque, check in checks.items():

@@ -18,7 +18,7 @@ Found = Mapping[str, Mapping[str, Sequence[tuple[ComparedRun, ComparedFigures]]]
 _HEAD = ('plant', 'controller', 'cost / least', 'worst', 'offset', 'offset under load',
          'farthest under load', 'above the limit', 'not held', 'step, median [ms]', '99 % [ms]')
 # The others lie upon one of these.
-_DRAWN = ('do-mpc with its MHE', 'LQG at the set-point', '`sdre`, lift', '`mpc`, lift')
+DRAWN = ('do-mpc with its MHE', 'LQG at the set-point', '`sdre`, lift', '`mpc`, lift')
 
 
 def figures_of(runs: Sequence[tuple[ComparedRun, ComparedFigures]]) -> dict[str, Any]:
@@ -64,7 +64,7 @@ def draw(found: Found, cases: Mapping[str, PartialCase], path: Path) -> Picture:
             case, (above, below) = cases[plant], (axes[column], axes[column + len(found)])
             system, name = case.system, case.shown
             i, j = system.state_names.index(name), int(np.argmax(np.abs(case.load)))
-            for number, contender in enumerate(_DRAWN):
+            for number, contender in enumerate(DRAWN):
                 run, color = contenders[contender][0][0], f'C{number}'
                 label = contender.replace('`', '')
                 above.plot(run.times, run.states[:, i], label=label, color=color, linewidth=1.1)

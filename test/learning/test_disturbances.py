@@ -22,7 +22,7 @@ from support.quick_retraining import quick_retraining
 def model(tmp_path_factory):
     """Learn from 100 minutes in which both temperatures step, and only the coolant is late."""
     task = late_reactor.task(tmp_path_factory.mktemp('learned'))
-    with quick_retraining(16, degrees=(1, 3, 4)):
+    with quick_retraining(4, degrees=(1, 3, 4)):
         retrained = retrain(task, record=late_reactor.record())
     assert retrained.reasons == ()
     assert retrained.free_runs['record'].fit[0] > 99.0

@@ -44,7 +44,7 @@ def task(output, **others):
 
 
 def test_the_applied_input_is_a_state_of_the_model(tmp_path):
-    with quick_retraining(8, degrees=(1,)):
+    with quick_retraining(4, degrees=(1,)):
         retrained = retrain(task(tmp_path / 'new.safetensors'), record=record())
         assert retrained.accepted, retrained.reasons
         model = load(retrained.model_file)

@@ -19,14 +19,14 @@ from support.long_records import bags_of, drift_error, source, SYSTEM, task
 from support.long_records import SAMPLES as LENGTH
 from support.quick_retraining import page_of, quick_retraining
 
-BAGS = 6
+BAGS = 3
 SAMPLES = BAGS * LENGTH
 
 
 @pytest.fixture(scope='module', autouse=True)
 def few_methods() -> Iterator[None]:
     """Estimate by a few methods alone, and try laws in a few loops."""
-    with quick_retraining(16):
+    with quick_retraining(4):
         yield
 
 
@@ -36,7 +36,8 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 def small(bags: list[Path], output: Path) -> TrainingTask:
-    return replace(task(bags, output), coordinates=2, starts=1, most_samples=3000)
+    return replace(task(bags, output), model_class='polynomial', most_samples=3000,
+                   dead_time={'coolant_temperature': 0.0})
 
 
 def test_it_is_as_good_as_a_record_of_that_length(bags: list[Path], tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def foreign(path: Path, compress: Callable[[bytes], bytes] = bytes, closed: bool
 KINDS = {
     **{compression: Kind(ours, {'compression': compression})
        for compression in ('none', 'zstd', 'lz4')},
-    'folder': Kind(ours, {'max_file_bytes': 1500}),
+    'folder': Kind(ours, {'max_file_bytes': 4000}),
     'messages compressed by rosbag2': Kind(foreign, {'compress': zstandard.compress}, False),
     'without checksums': Kind(foreign, {'enable_crcs': False}, False),
     'without chunks': Kind(foreign, {'use_chunking': False}, False),

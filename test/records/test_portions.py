@@ -50,15 +50,18 @@ def whole(path: Path, signal: records.RecordedInput, monkeypatch: pytest.MonkeyP
     return episode
 
 
+@pytest.fixture(scope='module')
+def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp('long') / 'long.mcap', 9000)
+
+
 @pytest.mark.parametrize('signal', [
     pytest.param(COMMANDED, id='commanded'), pytest.param(MEASURED, id='measured'),
     pytest.param(replace(COMMANDED, delay=7.0), id='dead time')])
 def test_portions_together_equal_the_whole_record(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, signal: records.RecordedInput
-) -> None:
-    path = record(tmp_path / 'long.mcap', 9000)
-    expected = whole(path, signal, monkeypatch)
-    episodes, account = records.loop_episodes([path], STATES, [signal])
+    long: Path, monkeypatch: pytest.MonkeyPatch, signal: records.RecordedInput) -> None:
+    expected = whole(long, signal, monkeypatch)
+    episodes, account = records.loop_episodes([long], STATES, [signal])
     # nearly equal ones
     assert len(episodes) == 5
     assert max(map(len, episodes)) <= 1800

@@ -111,15 +111,6 @@ def test_faults_of_messages_models_and_processes_are_survived(tmp_path: Path) ->
     assert result['reasons'] == []
 
 
-def test_an_unstable_plant_is_held_without_a_solver_and_without_its_sensor(tmp_path: Path) -> None:
-    case = replace(CASES['saddle-solver-missing'], play=CASES['saddle-lost'].play, between=True,
-                   settle=15.0, afterwards=30.0, recovery=0.0, largest_step=2.0)
-    result, found = run(case, tmp_path)
-    assert result['reasons'] == []
-    # with the solver the law would have planned
-    assert judge(found, replace(case, missing=()))['reasons'] != []
-
-
 def test_short_endurance_run_accounts_for_everything(tmp_path: Path) -> None:
     found = run_endurance(tmp_path / 'soak', lambda: None, hours=0.03)
     assert found['reasons'] == []

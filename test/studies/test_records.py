@@ -68,7 +68,7 @@ def test_sets_at_hand_are_run_and_stand_in_the_table(
     program = learn_files.main
     monkeypatch.setattr(learn_files, 'main', lambda words: program(
         [*words, '--model_class', 'linear']))
-    with quick_retraining(8, degrees=(1,)):
+    with quick_retraining(4, degrees=(1,)):
         assert study.main(['--records', str(tmp_path), '--output', str(tmp_path), '--seeds', '1',
                            '--scheduler', '', 'tanks', 'hair_dryer']) == 0
     printed = capsys.readouterr()
@@ -85,10 +85,10 @@ def test_a_folder_that_is_not_there_is_a_sentence(
         ) -> None:
     for module in (study, table):
         monkeypatch.setattr(module, 'SETS', {'hair_dryer': SETS['hair_dryer']})
-    monkeypatch.setattr(study, 'PLANTS', 2)
+    monkeypatch.setattr(study, 'PLANTS', 1)
     assert study.main(['--records', str(tmp_path / 'none'), '--output', str(tmp_path),
                        '--scheduler', '']) == 0
-    assert '2 of 2' in (tmp_path / 'report.md').read_text()
+    assert '1 of 1' in (tmp_path / 'report.md').read_text()
     assert 'there is no folder' in capsys.readouterr().err
 
 

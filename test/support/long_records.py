@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Records of a reactor under random steps of its coolant, in many bags, each over an hour long."""
+"""Records of a reactor under random steps of its coolant, in many bags."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -21,7 +21,7 @@ from koopman_ros.plants.library.reactor import OneStateReactor
 from koopman_ros.records import BagWriter, message_definition, RecordedInput, RecordedState
 
 TYPE, FIELD = 'geometry_msgs/msg/PointStamped', 'point.x'  # a number with a stamp, of any unit
-SAMPLES = 4000  # of a bag, one a second
+SAMPLES = 2500  # of a bag, one a second
 SYSTEM = OneStateReactor().system()
 _COOLANT, _HOLD, _NOISE = (281.3, 300.5), (30.0, 120.0), 0.1  # K, s, K
 _POINT = struct.Struct('<4siII4x3d')  # encapsulation, stamp, empty frame, point
@@ -84,6 +84,6 @@ def source(bags: Sequence[Path]) -> RecordSource:
 
 def drift_error(drift: Drift) -> float:
     """Return the error of a drift along a fresh run, relative to the drift's size."""
-    x, u = (values[::7] for values in simulated(14_000, 1, 99, noise=0.0))
+    x, u = (values[::7] for values in simulated(7_000, 1, 99, noise=0.0))
     true = SYSTEM.derivative(x, u) / SECONDS_PER_MINUTE
     return float(np.sqrt(np.mean((drift.rate(x, u) - true) ** 2) / np.mean(true ** 2)))

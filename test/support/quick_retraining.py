@@ -16,6 +16,7 @@ from koopman_ros.learning import (
     evaluate_model,
     pipeline,
 )
+from koopman_ros.learning.identification import identify_with_characteristics, structure_search
 from koopman_ros.learning.report import _sections
 from support.known_plants import methods
 
@@ -26,12 +27,14 @@ def quick_retraining(loops: int, degrees: tuple[int, ...] = (1, 3),
     """Estimate by a few methods alone, and try laws in so many loops."""
     fewer = {'degrees': degrees, 'methods': methods(*windows)}
     with pytest.MonkeyPatch.context() as patch:
-        for original in (drift_estimation.identify_with_characteristics,
-                         drift_estimation.identify_non_affine):
+        for original, *modules in (
+                (identify_with_characteristics, drift_estimation, structure_search),
+                (drift_estimation.identify_non_affine, drift_estimation)):
             def quick(*given, _original=original, **others):
                 return _original(*given, **{**others, **fewer})
 
-            patch.setattr(drift_estimation, original.__name__, quick)
+            for module in modules:
+                patch.setattr(module, original.__name__, quick)
         patch.setattr(pipeline, 'compare_classes', partial(compare_classes, loops=loops))
         patch.setattr(pipeline, 'evaluate_model', partial(evaluate_model, loops=loops))
         yield

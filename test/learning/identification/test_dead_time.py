@@ -23,7 +23,7 @@ def steps(rng, count, columns):
     return u
 
 
-def record(seed, dead_times, time_constants, gains=(1.0, -0.7), noise=0.03, count=800):
+def record(seed, dead_times, time_constants, gains=(1.0, -0.7), noise=0.03, count=500):
     """Return an episode of first-order lags in series behind inputs that act late."""
     rng = np.random.default_rng(seed)
     u = steps(rng, count, len(dead_times))

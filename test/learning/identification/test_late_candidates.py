@@ -3,14 +3,17 @@
 
 """Dead times of a plant that overflows, found together with a network."""
 
-
 import numpy as np
 import pytest
 
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.execution import Serial
-from koopman_ros.learning.identification import identify_structure, network_candidates
+from koopman_ros.learning.identification import (
+    identify_structure,
+    network_candidates,
+    structure_search,
+)
 from koopman_ros.learning.identification.data_split import SplitRecord
 from koopman_ros.learning.identification.late_candidates import late_as_suits
 from koopman_ros.learning.identification.network_candidates import add_networks, Shared
@@ -61,6 +64,7 @@ def test_a_network_gets_the_dead_time_of_the_plant(given):
 
 
 def test_dead_time_and_network_are_found_together(monkeypatch):
+    monkeypatch.setattr(structure_search, 'MOST_UNMEASURED', 1)
     monkeypatch.setattr(network_candidates, 'UNITS', (3,))
     monkeypatch.setattr(network_candidates, 'STARTS', 1)
     episode = record(400, LATE)

@@ -50,7 +50,7 @@ def test_the_columns_that_matter_are_found_and_no_others():
 def test_a_chain_of_states_with_cubic_losses_is_identified():
     """Degree 3 has 280 coefficients here."""
     plant = chain()
-    record = plant.excited(800, 0.2, noise=NOISE, level=2.0)
+    record = plant.excited(600, 0.2, noise=NOISE, level=2.0)
     found = identify(plant.plant, [record], degrees=(1, 3), methods=methods(10))
     drift = found.drift
     assert drift.degree == 3
