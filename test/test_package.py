@@ -51,16 +51,18 @@ ALLOWED = {
 
 
 @functools.cache
-def _imports(path: Path) -> set[str]:
-    """List the modules that a file imports, wherever the import stands."""
-    names = set()
+def _names(path: Path) -> tuple[set[str], list[str]]:
+    """List the modules that a file imports, wherever that stands, and its classes."""
+    modules, classes = set(), []
     for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            names.update(alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names.add(node.module)
-            names.update(f'{node.module}.{alias.name}' for alias in node.names)
-    return names
+        match node:
+            case ast.Import(names=names):
+                modules |= {alias.name for alias in names}
+            case ast.ImportFrom(module=str(module), names=names):
+                modules |= {module, *(f'{module}.{alias.name}' for alias in names)}
+            case ast.ClassDef(name=name):
+                classes.append(name)
+    return modules, classes
 
 
 def test_versions_agree_and_the_manifest_is_of_format_3_and_names_real_people() -> None:
@@ -92,7 +94,7 @@ def _third_party(*folders: str) -> set[str]:
     """Return the modules of other distributions that the files in folders import."""
     own = {'koopman_ros', 'studies', 'benchmarks', 'support', 'machines'}
     return {name.split('.')[0] for folder in folders for path in ROOT.glob(f'{folder}/**/*.py')
-            for name in _imports(path)} - own - sys.stdlib_module_names
+            for name in _names(path)[0]} - own - sys.stdlib_module_names
 
 
 # catkin_pkg's own
@@ -195,7 +197,7 @@ def test_imports_run_one_way(package: str) -> None:
     others = {f'koopman_ros.{other}'
               for other in set(ALLOWED) - ALLOWED[package] - {package, 'core'}}
     for path in ROOT.glob(f'koopman_ros/{package}/**/*.py'):
-        used = {'.'.join(name.split('.')[:2]) for name in _imports(path)}
+        used = {'.'.join(name.split('.')[:2]) for name in _names(path)[0]}
         assert not used & others, path
         if package not in ('ros', 'nodes', 'demo', 'testing'):
             assert not [name for name in used if re.match(
@@ -203,16 +205,15 @@ def test_imports_run_one_way(package: str) -> None:
 
 
 def test_no_class_name_has_two_meanings() -> None:
-    found = [node.name for folder in ('koopman_ros', 'studies', 'benchmarks')
-             for path in ROOT.glob(f'{folder}/**/*.py')
-             for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ClassDef)]
-    assert sorted(name for name, count in Counter(found).items() if count > 1) == []
+    found = Counter(name for folder in ('koopman_ros', 'studies', 'benchmarks')
+                    for path in ROOT.glob(f'{folder}/**/*.py') for name in _names(path)[1])
+    assert sorted(name for name, count in found.items() if count > 1) == []
 
 
 def test_installed_code_imports_only_installed_code_and_few_packages_import_torch() -> None:
     users, planners = set(), set()
     for path in ROOT.glob('koopman_ros/**/*.py'):
-        roots = {name.split('.')[0] for name in _imports(path)}
+        roots = {name.split('.')[0] for name in _names(path)[0]}
         assert not roots & {'studies', 'benchmarks', 'examples', 'support', 'test'}, path
         room = path.relative_to(ROOT).parts[1]
         users |= {room} if 'torch' in roots else set()

@@ -201,8 +201,7 @@ def test_without_the_observer_the_offset_stays():
     assert abs(loop.run(300)[-1].temperature - SETPOINT) > 3.0
 
 
-@pytest.mark.parametrize(('bandwidth', 'low', 'high'), [(2.0, 0.0, 0.03), (6.0, 0.04, 0.09),
-                                                        (12.0, 0.09, 0.4)])
+@pytest.mark.parametrize(('bandwidth', 'low', 'high'), [(2.0, 0.0, 0.03), (12.0, 0.09, 0.4)])
 def test_bandwidth_trades_noise_for_speed(bandwidth, low, high):
     loop = Reactor(controller(observer_bandwidth=bandwidth / 60.0), noise=0.1)
     commands = np.array([s.command for s in loop.run(600)[200:]])

@@ -202,7 +202,7 @@ def test_the_saddle_is_held_by_its_temperature_alone(estimator, constants, known
     loop = simulate(saddle(estimator=estimator), Process(SYSTEM, 0, x0, u0), [
         at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([350.0]))),
         at(60.0, changed(**constants)), at(300.0, SetpointRequest(0, np.array([345.0])))],
-        duration=700.0, noise=np.array([NOISE]), seed=1)
+        duration=600.0, noise=np.array([NOISE]), seed=1)
     T = loop.states[:, 1]
     assert set(loop.levels) == {'sdre'}
     assert np.max(np.abs(T[:300] - 350.0)) < 4.0
@@ -223,7 +223,7 @@ def test_a_wrong_initial_estimate_of_an_unmeasured_state_is_corrected(wrong):
     x0 = np.array([x0[0] + wrong, x0[1]])
     loop = simulate(saddle(), Process(SYSTEM, 0, x0, u0), [
         at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([350.0])))],
-        duration=400.0, noise=np.array([NOISE]), seed=2)
+        duration=250.0, noise=np.array([NOISE]), seed=2)
     assert set(loop.levels) == {'sdre'}
     assert abs(np.mean(loop.states[-100:, 1]) - 350.0) < 0.05
 

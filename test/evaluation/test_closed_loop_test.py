@@ -135,14 +135,14 @@ def test_a_law_that_fails_in_a_part_of_its_box_is_rejected_with_that_part():
     observables = PolynomialObservables.total_degree(1, 4)
     model = LiftedModel(observables, A, np.ones((1, 1)), STATE, INPUT, 's', Provenance('wrong'),
                         readout=A[:1])
-    found = evaluate_closed_loops(model, linear_rate(0.5))
+    found = evaluate_closed_loops(model, linear_rate(0.5), loops=64)
     x0, r = found.starts[:, 0], found.setpoints[:, 0]
     secant = 0.5 - 1.5 * (x0 ** 3 - r ** 3 + x0 ** 4 - r ** 4) / (x0 - r)
     lost = (x0 > r) & (x0 > 0.0) & (secant < -0.8)
-    assert np.sum(lost) > 10
+    assert np.sum(lost) > 5
     assert np.isinf(found.ratios[lost]).all()
     sound = (x0 < 0.1) & (r < 0.1)
-    assert np.sum(sound) > 20
+    assert np.sum(sound) > 10
     assert np.isfinite(found.ratios[sound]).all()
     assert not found.accepted
     failed = found.failed
@@ -191,16 +191,16 @@ def test_a_costly_law_is_rejected_by_its_cost():
 def test_setpoints_out_of_reach_within_limits_are_judged_without_limits():
     """With |u| <= 0.5 nothing brings dx/dt = x + u back from |x| > 0.5."""
     tight = InputLimits(np.full(1, -0.5), np.full(1, 0.5), np.full(1, np.inf))
-    found = evaluate_closed_loops(scalar(), linear_rate(1.0), limits=tight, loops=64)
+    found = evaluate_closed_loops(scalar(), linear_rate(1.0), limits=tight, loops=32)
     assert found.accepted
-    assert 20 < found.hopeless < 44
-    assert found.loops == 64
+    assert 10 < found.hopeless < 22
+    assert found.loops == 32
     assert np.all(np.isfinite(found.excess))
     # they do not hide what another law costs out there
-    costly = evaluate_closed_loops(scalar(), linear_rate(1.0), limits=tight, loops=64,
+    costly = evaluate_closed_loops(scalar(), linear_rate(1.0), limits=tight, loops=32,
                                    law=Constant)
     far = np.abs(costly.starts[:, 0]) > 0.55
-    assert np.sum(far) > 20
+    assert np.sum(far) > 10
     assert np.all(costly.excess[far] > 1.05)
     assert np.max(np.abs(found.setpoints)) <= 0.5 + 1e-9
     # nor is it a recommendation where there is nothing else
@@ -229,7 +229,7 @@ def too_steady():
 
 @cache
 def too_steady_on_its_plant():
-    return evaluate_closed_loops(too_steady(), linear_rate(1.0))
+    return evaluate_closed_loops(too_steady(), linear_rate(1.0), loops=64)
 
 
 def test_a_loss_that_a_perfect_model_shares_does_not_count():
@@ -249,8 +249,8 @@ def test_a_loss_that_a_perfect_model_shares_does_not_count():
 def test_a_cost_that_a_better_model_would_save_counts_against_a_model():
     """A linear model passes beside linear laws, but another would save much."""
     model, rate = cubic(0.5, 0.5, 0.0, 8.0)
-    assert evaluate_closed_loops(model, rate, loops=64).failed.sum() == 0
-    found = evaluate_closed_loops(model.linearised, rate, loops=64)
+    assert evaluate_closed_loops(model, rate, loops=32).failed.sum() == 0
+    found = evaluate_closed_loops(model.linearised, rate, loops=32)
     assert found.poor.sum() == 0
     assert found.ratios.max() == pytest.approx(1.0)
     assert not found.accepted

@@ -7,8 +7,6 @@ from pathlib import Path
 import subprocess
 import sys
 
-import pytest
-
 import koopman_ros
 
 
@@ -35,8 +33,7 @@ def test_the_model_loads_no_other_package_of_ours_but_core() -> None:
     assert ours == {'core', 'model', 'model_classes'}
 
 
-@pytest.mark.parametrize('node', ['controller', 'trainer'])
-def test_nodes_load_nothing_large_that_they_do_not_need(node: str) -> None:
-    assert not loaded(f'koopman_ros.nodes.{node}') & {
+def test_nodes_load_nothing_large_that_they_do_not_need() -> None:
+    assert not loaded('koopman_ros.nodes.controller, koopman_ros.nodes.trainer') & {
         'torch', 'matplotlib', 'pint', 'daqp', 'nicegui', 'koopman_ros.plants',
         'koopman_ros.learning'}

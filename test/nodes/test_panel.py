@@ -324,6 +324,7 @@ def test_the_loop_continues_while_the_panel_is_flooded_stopped_and_killed(
     ros.start('plant', {'lockstep': True, 'lockstep_subscribers': 3, 'speed': 0.0})
     commands: list[Temperature] = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
     ros.listen(Temperature, reactor.TEMPERATURE)
+    ros.wait_until(lambda: commands)
     flood(ros, address(ros, process), lambda: len(commands) > 60)
     # more than a queue holds
     process.process.send_signal(signal.SIGSTOP)
