@@ -4,12 +4,13 @@
 """The laws against exact optima."""
 
 from dataclasses import replace
+import pickle
 
 import numpy as np
 import pytest
 from scipy.linalg import solve_continuous_are
 
-from koopman_ros.control import Tuning
+from koopman_ros.control import Controller, State, Tuning
 from koopman_ros.control.laws import averaged, feedback, Form, LAWS, recentred, riccati, Weights
 from koopman_ros.control.laws.base import steady_state_target
 from koopman_ros.core.solvers import runge_kutta_step, solve_riccati
@@ -338,6 +339,18 @@ def test_the_linear_law_is_solved_for_the_interval():
         K = solve_riccati(linear.A, linear.B, weights.Q, weights.R, interval=seconds / 60.0).K
         u = linear.inputs.to_physical(target.u - K @ (estimate.x - target.x))
         np.testing.assert_allclose(found.u, u, rtol=1e-12)
+
+
+@pytest.mark.parametrize('law', ['mpc', 'sdre', 'linear'])
+def test_a_controller_that_has_run_can_be_pickled(law):
+    model = shipped('reactor_nz4')
+    loop = Controller(model, Tuning.for_model(model, fallback_order=[law]))
+    state, _, _ = loop.step(State(), model.states.center, 1)
+    again, kept = pickle.loads(pickle.dumps((loop, state)))
+    hot = model.states.center + 2.0
+    _, command, report = loop.step(state, hot, 10 ** 9)
+    assert report.level == law
+    assert again.step(kept, hot, 10 ** 9)[1] == command
 
 
 def test_a_law_that_is_predicted_unstable_is_not_used():

@@ -249,7 +249,8 @@ def test_a_state_within_the_ranges_is_far_from_the_data_beyond_the_margin(
 def test_a_disturbance_at_its_bound_is_a_warning_of_the_model() -> None:
     own, state, report = measured(Mode.AUTOMATIC)
     assert statuses(context(own, state, report))['model'].level is Severity.OK
+    large = replace(report.estimate.estimate, w=own.best.estimator.bounded(np.array([1e3])))
     found = statuses(context(own, state, replace(
-        report, estimate=report.estimate._replace(at_bound=True))))
+        report, estimate=report.estimate._replace(estimate=large))))
     assert (found['model'].level, found['control'].level) == (Severity.WARN,) * 2
     assert 'at its bound' in found['model'].message

@@ -91,8 +91,8 @@ say = StatusFormatter(Displays({'temperature': 'K', 'coolant_temperature': 'K'})
 
 
 def content(value: Any) -> str:
-    """Write a state, or the result of a step, so that they compare bit for bit."""
-    if not isinstance(value, control.State):
+    """Write a state, a model or the result of a step so that they compare bit for bit."""
+    if type(value) is tuple:
         state, command, report = value
         found = report.estimate
         value = state, command, replace(report, estimate=None), found and (
