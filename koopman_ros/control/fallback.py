@@ -111,7 +111,7 @@ class FallbackLevel:
             x[self._indices] = goal
             return Target(x, np.zeros(model.n_u), np.zeros(n), 0.0)
         if self.controls_all:
-            return steady_state_target(model, goal, w, self.law.drift_at(tuple(goal.tolist())))
+            return steady_state_target(model, goal, w)
         y = np.zeros(n + model.n_u) if start is None else np.concatenate(
             (model.states.to_deviation(start[:n]), inputs.to_deviation(start[n:])))
         return partial_target(

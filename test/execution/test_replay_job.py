@@ -24,4 +24,4 @@ def test_the_experiment_ends_with_its_reason(tmp_path: Path) -> None:
             time.sleep(0.05)
     finally:
         job.close()
-    assert "bag 'none.mcap' does not exist" in job.said
+    assert "bag 'none.mcap' does not exist" in job.last_output

@@ -87,7 +87,7 @@ def test_chart_tooltips_escape_markup(client: Client) -> None:
 
 def test_the_tasks_of_a_closed_page_end(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     source, waiting = HostileSource(), Future[Answer]()
-    monkeypatch.setattr(source, 'ask', lambda _: waiting)
+    monkeypatch.setattr(source, 'request', lambda _: waiting)
     layout = PageLayout(source, Visitor('anna', lambda: True), '/')
 
     async def closed() -> None:

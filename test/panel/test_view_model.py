@@ -318,14 +318,14 @@ def test_a_silence_has_its_node_and_time() -> None:
     own = view()
     assert own.snapshot(NOW + 1.0).silences == ()
     silences = own.snapshot(NOW + 10.0).silences
-    assert [(one.role, one.since, one.ever) for one in silences] == [
+    assert [(one.role, one.since, one.seen) for one in silences] == [
         (CONTROLLER, NOW, False), (PLANT, NOW, False)]
     for second in range(1, 20):
         measure(own, 50.0, float(second))
         status(own, CONTROL, OK, 'automatic', {}, NOW + second)
     assert own.snapshot(NOW + 20.0).silences == ()
     (silence,) = (one for one in own.snapshot(NOW + 30.0).silences if one.role == PLANT)
-    assert (silence.since, silence.ever) == (NOW + 19.0, True)
+    assert (silence.since, silence.seen) == (NOW + 19.0, True)
 
 
 def test_a_slow_plant_is_not_silent_between_its_measurements() -> None:

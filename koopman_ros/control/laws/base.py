@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 import math
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -40,8 +40,7 @@ class Target:
             (until - seconds, target) for until, target in self.later if until > seconds))
 
 
-def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None,
-                        drift: Array | None = None) -> Target:
+def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None) -> Target:
     """
     Solve f(x_ref) + B(x_ref) u_ref + w = 0 for u_ref by least squares, f the model's drift.
 
@@ -50,10 +49,8 @@ def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None
 
     :param x_ref: (n_x,) scaled deviation.
     :param w: (n_x,) disturbance of the state's rate, none by default.
-    :param drift: (n_x,) f(x_ref), where it is known.
     """
-    w = np.zeros(model.n_x) if w is None else w
-    drift = model.drift(x_ref) if drift is None else drift
+    w, drift = np.zeros(model.n_x) if w is None else w, model.drift(x_ref)
     u = -model.input_inverse(x_ref).dot(drift + w)
     forcing = model.forcing(x_ref, u) + w
     return Target(x_ref, u, forcing, math.hypot(*(drift + forcing).tolist()))
@@ -216,8 +213,6 @@ class Law(ABC):
         self.model = model
         self.tuning = tuning
         self.parameters = parameters
-        #: the model's drift (n_x,) at a set-point, which rarely moves, as a tuple
-        self.drift_at = lru_cache(maxsize=1)(lambda x: model.drift(np.array(x)))
 
     def __reduce__(self) -> tuple[Any, ...]:
         # without state it is what it was constructed from; a cache need not be pickled

@@ -115,15 +115,14 @@ def test_targets_are_steady_states_of_the_plant():
 
 @pytest.mark.parametrize('law', [averaged, recentred])
 def test_the_error_obeys_the_equation_of_the_law(law):
-    """Exactly so for a drift of degree 1, whose lift is closed: e' = (A_x + action) e."""
+    """Exactly so for a drift of degree 1, whose lift is closed: e' = loop e."""
     model = Edmd(1).learn(UNKNOWN, samples())
     target = steady_state_target(model, np.array([0.4, -0.3]))
     x = np.array([-0.6, 0.5])
     found = law(model, x, target, Weights(np.eye(2), np.eye(2)))
     assert found.solved
     rate = model.rate_under(found.u)(x)
-    np.testing.assert_allclose(rate, (found.drift + found.action) @ (x - target.x), rtol=0,
-                               atol=1e-10)
+    np.testing.assert_allclose(rate, found.loop @ (x - target.x), rtol=0, atol=1e-10)
 
 
 def test_the_loop_reaches_a_set_point_that_needs_another_flow():
