@@ -68,7 +68,7 @@ def test_dead_time_and_network_are_found_together(monkeypatch):
     monkeypatch.setattr(structure_search, 'MOST_UNMEASURED', 1)
     monkeypatch.setattr(network_candidates, 'UNITS', (3,))
     monkeypatch.setattr(network_candidates, 'STARTS', 1)
-    found = identify_structure(PLANT, [record(400, LATE)], methods=methods(20))
+    found = identify_structure(PLANT, [record(300, LATE)], methods=methods(20))
     assert isinstance(found.drift, NetworkDrift)
     assert found.dead_time / PERIOD == pytest.approx([LATE], abs=1.0)
     # of linear models, also those whose states stand for the dead time
