@@ -60,7 +60,7 @@ def identified(plant, noise):
 
 def compared(found, model_class=BEST, thresholds=GATE, n_z=2, **others):
     return compare_classes(found, BENT.plant, thresholds, model_class=model_class, n_z=n_z, seed=0,
-                           starts=1, loops=8, **others)
+                           starts=1, loops=4, **others)
 
 
 @pytest.fixture(scope='module')
@@ -106,7 +106,7 @@ def test_noise_neither_hides_an_error_nor_makes_one(bend, chosen):
     assert 1.05 < linear / polynomial < np.sqrt(2.0)
     assert comparison.chosen.name == chosen
     # which no linear model has to be better than
-    assert evaluate_model(found, comparison, None, GATE, loops=8).accepted
+    assert evaluate_model(found, comparison, None, GATE, loops=4).accepted
 
 
 @pytest.fixture
@@ -134,7 +134,7 @@ def test_a_class_that_is_named_is_learned_alone(found, name):
     alone = compared(found, name)
     assert [one.name for one in alone.contenders] == [name]
     assert alone.chosen.name == name
-    decision = evaluate_model(found, alone, None, GATE, loops=8)
+    decision = evaluate_model(found, alone, None, GATE, loops=4)
     # its loops are not run again
     assert decision.law_check is alone.chosen.law_check
     assert decision.rmse == alone.figures.rollout_rmse
@@ -145,7 +145,7 @@ def test_a_class_that_is_named_is_learned_alone(found, name):
 def test_a_rejection_advises_to_compare_the_classes_unless_they_were_compared(found, best):
     strict = Thresholds(condition=0.5 * (1.0 + best.figures.fit.cond))
     for learned, advised in ((best, False), (compared(found, 'polynomial'), True)):
-        (reason,) = evaluate_model(found, learned, None, strict, loops=8).reasons
+        (reason,) = evaluate_model(found, learned, None, strict, loops=4).reasons
         assert reason.startswith('the condition number')
         assert (f'set model_class to {BEST}' in reason) == advised
 

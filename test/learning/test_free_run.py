@@ -185,9 +185,9 @@ def test_an_identification_with_unmeasured_states_is_learned_and_simulated_as_it
     found = Identified(drift(), 'output error', drift(), (), np.full(2, 1e-3), tuple(parts[:-2]),
                        tuple(parts[-2:]), hidden=1)
     learned = compare_classes(found, record.plant, Thresholds(), model_class='linear', n_z=3,
-                              seed=0, starts=1, loops=8)
+                              seed=0, starts=1, loops=4)
     assert learned.model.states.names == STATES.names
-    assert np.all(evaluate_model(found, learned, None, Thresholds(), loops=8).rmse < 1e-5)
+    assert np.all(evaluate_model(found, learned, None, Thresholds(), loops=4).rmse < 1e-5)
     for model in (found, learned, learned.model):
         assert simulate(model, record).fit[0] > 99.9
     with pytest.raises(ValueError, match='linear'):

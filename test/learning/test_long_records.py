@@ -36,8 +36,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 def small(bags: list[Path], output: Path) -> TrainingTask:
-    return replace(task(bags, output), model_class='polynomial', most_samples=3000,
-                   dead_time={'coolant_temperature': 0.0})
+    return replace(task(bags, output), most_samples=3000)
 
 
 def test_it_is_as_good_as_a_record_of_that_length(bags: list[Path], tmp_path: Path) -> None:

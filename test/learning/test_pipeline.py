@@ -54,8 +54,8 @@ def few_methods():
 
 def small(bag, output, present=SHIPPED, **others):
     return TrainingTask((str(bag),), str(output), str(present), STATES, INPUTS, coordinates=2,
-                        starts=1, dead_time={'coolant_temperature': 0.0},
-                        **{'model_class': 'identity lift', **others})
+                        starts=1, dead_time={'coolant_temperature': 0.0}, **{
+                            'model_class': 'identity lift', **others})
 
 
 @pytest.fixture(scope='module')

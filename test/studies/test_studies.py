@@ -18,7 +18,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from koopman_ros.core.paths import model_path
-from koopman_ros.evaluation.optimal_cost import optimum
 from koopman_ros.learning import IncrementalTraining, Linearisation, NeuralDrift, rollout_rmse
 from koopman_ros.model import load
 from koopman_ros.parameters.plant import PlantTable
@@ -39,7 +38,6 @@ from studies.paper.optimal_control import (
 from studies.partly_measured import __main__ as partly_measured
 from studies.partly_measured.cases import CASES as PARTLY_MEASURED
 from studies.partly_measured.report import DRAWN as DRAWN_CONTENDERS
-from studies.partly_measured.study import least
 from studies.robustness import disturbances, loop, stability
 from studies.robustness.loop import REACTOR, START
 from studies.true_model import TrueModel
@@ -107,12 +105,6 @@ def test_expressions_and_the_true_model_are_the_plants_equations(case: Any) -> N
             rtol=1e-9, atol=1e-11)
 
 
-def test_two_methods_find_the_least_cost() -> None:
-    case = PARTLY_MEASURED['pendulum']
-    course = least(case, case.start[0])
-    assert course.cost == pytest.approx(optimum(case.task(case.start[0])).cost, rel=1e-7)
-
-
 @pytest.mark.parametrize('name', CASES)
 def test_cases_rest_at_their_nominal_state_and_are_factorised(name: str) -> None:
     case = CASES[name]
@@ -143,7 +135,7 @@ def campaign() -> Iterator[Campaign]:
             two_state.SYSTEM.drift_jacobian(np.zeros(2))).learn(
                 plant, two_state.samples(two_state.WIDE, 0, episodes=5))}
         models = {name: load(model_path(f'reactor_{name.replace("=", "")}'))
-                  for name in ('nz=3', 'nz=4', 'linear')}
+                  for name in ('nz=3', 'linear')}
         fresh = [reactor.random_steps_of(design, 1, 15.0, 5_000)
                  for design in (reactor.IN_RANGE, reactor.IN_RANGE, reactor.OUT_OF_RANGE)]
         for name, (metrics, of) in {
@@ -170,9 +162,8 @@ def test_figures_of_the_paper(campaign: Campaign) -> None:
     of_reactor = found['reactor']
     assert of_reactor['linear/feed_forward_offset_kelvin'] == pytest.approx(3.3009, abs=1e-4)
     assert of_reactor['linear/tracking_offset_kelvin'] == pytest.approx(1.9334, abs=1e-4)
-    for name in ('nz=3', 'nz=4'):
-        assert of_reactor[f'{name}/tracking_offset_kelvin'] < 1e-3  # type: ignore[operator]
-        assert of_reactor[f'{name}/cost_ratio_to_optimum'] == pytest.approx(1.0, abs=1e-5)
+    assert of_reactor['nz=3/tracking_offset_kelvin'] < 1e-3  # type: ignore[operator]
+    assert of_reactor['nz=3/cost_ratio_to_optimum'] == pytest.approx(1.0, abs=1e-5)
 
 
 def test_report_of_the_paper_has_its_tables_and_figures(
@@ -184,7 +175,7 @@ def test_report_of_the_paper_has_its_tables_and_figures(
     for one in drawn:
         # neither blank nor one colour
         assert np.std(matplotlib.image.imread(tmp_path / one.file)[..., :3]) > 0.02
-    missing = re.compile(r'nz=[25]|R=0\.')
+    missing = re.compile(r'nz=[245]|R=0\.')
     monkeypatch.setattr(report, 'TARGETS', [
         target for target in report.TARGETS if not missing.search(target.path)])
     monkeypatch.setattr(report, '_EXACT', {

@@ -67,13 +67,14 @@ def bags_of(count: int, folder: Path) -> list[Path]:
 
 
 def task(bags: Sequence[Path], output: Path) -> TrainingTask:
-    """Return the task of a first lift from some bags."""
+    """Return the task of a first model from some bags."""
     state, coolant = (MessageField(f'/{name}', TYPE, FIELD, 'K')
                       for name in ('temperature', 'coolant_temperature'))
     return TrainingTask(tuple(map(str, bags)), str(output), '',
                         (RecordedState('temperature', 'K', state),),
                         (RecordedInput('coolant_temperature', 'K', coolant),),
-                        plant='reactor at 1 Hz', model_class='identity lift')
+                        plant='reactor at 1 Hz', model_class='polynomial',
+                        dead_time={'coolant_temperature': 0.0})
 
 
 def source(bags: Sequence[Path]) -> RecordSource:

@@ -20,6 +20,7 @@ from koopman_ros.learning.identification.network_candidates import add_networks,
 from koopman_ros.learning.identification.network_drift import NetworkDrift
 from koopman_ros.learning.identification.polynomial_candidates import PolynomialSearch
 from koopman_ros.learning.identification.structure_candidates import Choice
+from support.known_plants import methods
 
 PLANT = PlantDescription('overflow', ('level',), ('m',), ('flow',), ('l/s',), 's', np.zeros(1),
                          np.zeros(1), None)
@@ -67,8 +68,7 @@ def test_dead_time_and_network_are_found_together(monkeypatch):
     monkeypatch.setattr(structure_search, 'MOST_UNMEASURED', 1)
     monkeypatch.setattr(network_candidates, 'UNITS', (3,))
     monkeypatch.setattr(network_candidates, 'STARTS', 1)
-    episode = record(400, LATE)
-    found = identify_structure(PLANT, [episode])
+    found = identify_structure(PLANT, [record(300, LATE)], methods=methods(20))
     assert isinstance(found.drift, NetworkDrift)
     assert found.dead_time / PERIOD == pytest.approx([LATE], abs=1.0)
     # of linear models, also those whose states stand for the dead time
