@@ -290,7 +290,7 @@ def test_a_start_up_from_far_outside_the_data_arrives():
     u0 = np.array([300.0])
     loop = simulate(one, Process(SYSTEM, 0, np.array([0.95, 300.0]), u0), [
         at(0.0, Initialisation(u0)), at(5.0, SetpointRequest(0, np.array([350.0])))],
-        duration=1100.0, noise=np.array([NOISE]), seed=7)
+        duration=800.0, noise=np.array([NOISE]), seed=7)
     levels = loop.levels
     assert set(levels) == {'pi', 'sdre'}
     taken_over = levels.index('sdre')
