@@ -106,6 +106,7 @@ def _model(page: PageLayout) -> None:
             answer.show(await page.act('reload', CONTROLLER))
 
         async def activate(name: str, rejected: bool = False) -> None:
+            answer.set_text('')
             now, view = page.source.snapshot, page.source.view
             current = now.status(CONTROL).values.get('model', 'the current model')
             details = [

@@ -44,9 +44,10 @@ class Actuator:
 
     def _over_range(self, u: Array, law: Callable[[Array, Array], Array]) -> Array:
         """Apply a law to the shares of the range, where it is not the identity."""
-        curved = np.broadcast_to(np.greater(self.rangeability, 1.0), np.shape(u)[-1:])
+        curved = np.greater(self.rangeability, 1.0)
         if not curved.any():
             return u
+        curved = np.broadcast_to(curved, np.shape(u)[-1:])
         lower, upper, R = (np.broadcast_to(value, curved.shape)[curved]
                            for value in (self.lower, self.upper, self.rangeability))
         found = np.array(u)

@@ -40,16 +40,13 @@ from koopman_ros.panel.snapshot import CONTROLLER, TRAINER
 from koopman_ros.ros import topics
 from koopman_ros.ros.controller_status import TASKS
 from koopman_ros.testing import Harness, NodeProcess
+from support.browser import ADDRESS
 from support.nodes import complaint, run_here, temperature, TIMEOUT, value
 from support.users import write_users
 
-_ADDRESS = re.compile(r'the panel is at (http://127\.0\.0\.1:\d+)')
-
 
 def address(ros: Harness, process: NodeProcess) -> str:
-    found = ros.wait_until(lambda: _ADDRESS.search(process.output()))
-    assert found is not None
-    return found[1]
+    return ros.wait_until(lambda: ADDRESS.search(process.output()))[1]
 
 
 class _Stay(HTTPRedirectHandler):
@@ -140,9 +137,10 @@ def test_users_log_in_over_tls_alone_and_wrong_passwords_wait(
     key, certificate = tmp_path / 'key.pem', tmp_path / 'panel.pem'
     users = write_users(tmp_path / 'users')
     subprocess.run(
-        ['openssl', 'req', '-x509', '-newkey', 'rsa:2048', '-nodes', '-days', '2', '-subj',
-         '/CN=127.0.0.1', '-addext', 'subjectAltName=IP:127.0.0.1', '-keyout', str(key), '-out',
-         str(certificate)], check=True, capture_output=True)
+        ['openssl', 'req', '-x509', '-newkey', 'ec', '-pkeyopt', 'ec_paramgen_curve:P-256',
+         '-nodes', '-days', '2', '-subj', '/CN=127.0.0.1', '-addext',
+         'subjectAltName=IP:127.0.0.1', '-keyout', str(key), '-out', str(certificate)],
+        check=True, capture_output=True)
     process = ros.start('panel', {'port': 0, 'host': '0.0.0.0', 'users': users,
                                   'tls_certificate': certificate, 'tls_key': key})
     found = ros.wait_until(lambda: re.search(r'at https://0\.0\.0\.0:(\d+)', process.output()))
