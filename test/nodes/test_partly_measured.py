@@ -68,9 +68,8 @@ def test_a_lift_with_a_hidden_state_takes_over_from_a_pi_law_without_offset(
     assert max(abs(after.temperature - before.temperature)
                for before, after in itertools.pairwise(commands[begun:])) < 1.0
     # nor is one left by a feed that the model does not know, and the other state is still known
-    (result,) = ros.set_parameters('plant', **{
-        'constants.feed_temperature': FEED - to_kelvin(0.0)})
-    assert result.successful, result.reason
+    assert ros.set_parameters('plant', **{
+        'constants.feed_temperature': FEED - to_kelvin(0.0)})[0].successful
     begun = len(measured)
     ros.wait_until(lambda: len(measured) > begun + 250)
     late = np.array([message.temperature for message in measured[-100:]])
