@@ -140,12 +140,10 @@ def test_manual_mode_sends_the_command_of_the_operator(bench: Bench) -> None:
     manual = bench.ros.speak(Temperature, reactor.MANUAL_COOLANT_SETPOINT, to='controller')
     at, held = bench.settle(STEADY, 2.0)
     manual.publish(temperature(20.0))
-    status = bench.status(lambda s: 'switch to manual mode' in s.message)
-    assert status.level == DiagnosticStatus.WARN
+    bench.status(lambda s: s.level == DiagnosticStatus.WARN and 'switch to manual' in s.message)
     assert bench.measure(STEADY, at + 1.0).temperature == pytest.approx(held, abs=1e-6)
 
-    response = bench.ros.set_bool('controller/set_automatic', False)
-    assert (response.success, response.message) == (True, 'manual mode')
+    assert bench.ros.set_bool('controller/set_automatic', False).message == 'manual mode'
     held = bench.measure(STEADY, at + 2.0).temperature
     assert bench.measure(STEADY + 1.0, at + 3.0).temperature == held
     manual.publish(temperature(20.0))
@@ -288,9 +286,8 @@ def test_the_status_has_mode_law_reason_and_figures(bench: Bench) -> None:
     bench.measure(STEADY, last + 4.0)
     assert value(bench.status(), 'missed measurements') == str(missed + 3)
     bench.ros.set_parameters('controller', max_measurement_age=1.0)
-    status = bench.status(lambda s: 'old on receipt' in s.message)
-    assert status.level == DiagnosticStatus.WARN
-    assert 'max_measurement_age allows 1 s' in status.message
+    bench.status(lambda s: s.level == DiagnosticStatus.WARN and (
+        'max_measurement_age allows 1 s' in s.message))
     # with stamps near the wall's, a rate limit would last as long on the way back as on the wall
     bench.ros.set_parameters('controller', observer_bandwidth=0.0, **{
         'coolant_temperature.rate_limit': 0.0})
@@ -305,8 +302,8 @@ def test_stamps_that_stand_still_and_a_temperature_outside_the_trained_range_are
     bench.measure(STEADY, 3.0)
     bench.status(lambda s: s.level == DiagnosticStatus.OK)
     assert math.isfinite(bench.measure(54.5, 6.0).temperature)
-    status = bench.status(lambda s: 'outside the trained range' in s.message)
-    assert status.level == DiagnosticStatus.WARN
+    status = bench.status(lambda s: s.level == DiagnosticStatus.WARN and (
+        'outside the trained range' in s.message))
     assert value(status, 'active law') == 'learned law'
 
 

@@ -64,7 +64,6 @@ def test_a_measured_step_of_the_feed_peaks_at_a_third_of_an_unmeasured_one_or_le
     result = json.loads((tmp_path / 'summary.json').read_text())
     assert result['peak_unmeasured_kelvin'] == pytest.approx(0.91, abs=0.1)
     assert result['peak_ratio'] < 1.0 / 3.0
-    assert result['peak_measured_kelvin'] < 0.25
     assert (tmp_path / 'disturbance.png').read_bytes().startswith(b'\x89PNG')
     # the records of the loop give its commands again
     replayed = replay_records(

@@ -110,8 +110,7 @@ def test_loops_of_a_process(ros: Harness, tmp_path: Path) -> None:
     # its own parameters and model
     assert ros.get_parameters(r1.node, 'model', 'hold_timeout') == [reactor.MODEL, 30.0]
     assert ros.get_parameters(r2.node, 'model', 'hold_timeout') == [str(model), 40.0]
-    (result,) = ros.set_parameters(r2.node, hold_timeout=50.0)
-    assert result.successful
+    assert ros.set_parameters(r2.node, hold_timeout=50.0)[0].successful
     assert ros.get_parameters(r1.node, 'hold_timeout') == [30.0]
 
     # the one that cannot start keeps no other from it
@@ -132,8 +131,7 @@ def test_loops_of_a_process(ros: Harness, tmp_path: Path) -> None:
     assert [message.temperature for message in r2.active] == pytest.approx([STEADY])
 
     # an asynchronous service
-    response = ros.trigger(f'{r2.node}/reload_model')
-    assert response.success, response.message
+    assert ros.trigger(f'{r2.node}/reload_model').success
     model.write_bytes(b'no model')
     assert not ros.trigger(f'{r2.node}/reload_model').success
 
@@ -180,9 +178,7 @@ def test_program_of_which_no_loop_is_left_ends(
         tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'loops.txt').write_text('a\nb')
     loops = ('--', '--loops', str(tmp_path / 'loops.txt'))
-    assert run_here(controller, *loops, model='nowhere.safetensors') == 1
-    said = capfd.readouterr().err
-    assert said.count('cannot start: no model file at nowhere.safetensors') == 2
-    assert run_here(controller, '-r', '__ns:=/elsewhere', *loops) == 1
-    assert 'controller: cannot start: -r __ns:=/elsewhere would apply to all loops' in (
-        capfd.readouterr().err)
+    for given, words, count in ((('-p', 'model:=nowhere.safetensors'), 'no model file at nowh', 2),
+                                (('-r', '__ns:=/elsewhere'), 'would apply to all loops', 1)):
+        assert run_here(controller, *given, *loops) == 1
+        assert capfd.readouterr().err.count(words) == count

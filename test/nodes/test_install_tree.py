@@ -16,7 +16,7 @@ import venv
 
 import pytest
 
-from koopman_ros.testing import Harness, isolated_domain
+from koopman_ros.testing import Harness
 from support.installation import Installation, ROOT, run, sources, underlay
 
 NODES = {'plant': 'simulation', 'controller': 'control', 'trainer': 'recording'}
@@ -104,12 +104,3 @@ def test_nodes_of_the_wheel_start_with_their_parameter_files_and_end(
         ros.wait_for_status(f'{name}: {task}', lambda status: True)
     assert [process.stop() for process in started] == [0, 0, 0]
     assert wheel.opened() == ''
-
-
-# one is enough to see that what is laid out is found: the programs are the same
-def test_a_tool_reads_its_parameters(colcon: Installation) -> None:
-    with isolated_domain():
-        ended = run(colcon.command(str(colcon.executables / 'player'), '--ros-args', '-p',
-                                   'bag:=none'))
-    assert ended.returncode == 1
-    assert "cannot start: bag 'none' does not exist" in ended.stderr

@@ -48,6 +48,12 @@ def put(content: bytes, path: Path) -> None:
     os.replace(new, path)
 
 
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    put(model_path('reactor_nz4').read_bytes(), file := tmp_path / 'model.safetensors')
+    return file
+
+
 class Bench:
     """Measures a reactor that swings, and changes the model of a running controller."""
 
@@ -92,13 +98,11 @@ class Bench:
         return float(self.commands[-1].temperature)
 
 
-def test_reloads_under_load_leave_no_trace(ros: Harness, tmp_path: Path) -> None:
+def test_reloads_under_load_leave_no_trace(ros: Harness, file: Path) -> None:
     """Each command is the very one that the models give in turn, and none of them jumps."""
-    file = tmp_path / 'model.safetensors'
     contents = {name: model_path(name).read_bytes() for name in NAMES}
     whole = contents['reactor_nz4']
     bad = itertools.cycle((b'', b'garbage' * 1000, whole[:len(whole) // 2], whole[:-1]))
-    put(whole, file)
     ros.start('controller', {'model': file, **SETTINGS, **PATIENT})
     records = ros.listen(String, topics.EVENT_LOG)
     bench = Bench(ros)
@@ -178,8 +182,7 @@ def test_rejected_model_leaves_the_old_one_in_force_until_the_operator_forces_it
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
     assert value(status, 'model rejected') == 'none'
 
-    result = change(load_rejected_model=True, model=str(file))
-    assert result.successful, result.reason
+    assert change(load_rejected_model=True, model=str(file)).successful
     done, about = bench.reload()
     assert done
     assert 'too large an error' in about
@@ -192,16 +195,13 @@ def test_rejected_model_leaves_the_old_one_in_force_until_the_operator_forces_it
 
     # a model and the bound that it needs are changed together
     assert 'the gain exceeds its bound' in change(model='reactor_linear', max_gain=1e-3).reason
-    result = change(model='reactor_linear', max_gain=500.0)
-    assert result.successful, result.reason
+    assert change(model='reactor_linear', max_gain=500.0).successful
     assert ros.get_parameters('controller', 'model', 'max_gain') == ['reactor_linear', 500.0]
 
 
 def test_a_model_that_predicts_recent_measurements_much_worse_is_rejected(
-        ros: Harness, tmp_path: Path, run_node: RunNode) -> None:
+        ros: Harness, file: Path, run_node: RunNode) -> None:
     """It takes over neither by parameter nor by service, unless the operator insists."""
-    file = tmp_path / 'model.safetensors'
-    put(model_path('reactor_nz4').read_bytes(), file)
     run_node(ControllerNode, {'model': file, 'bumpless_transfer_time': 0.0, **PATIENT})
     bench = Bench(ros)
     bench.period = 5.0
@@ -245,9 +245,8 @@ def test_a_model_that_predicts_recent_measurements_much_worse_is_rejected(
         assert present < allowed < wrong
     ros.wait_for_status(STATUS, lambda s: s.message == reason)
     track(44.0)
-    result = until_read(lambda: ros.set_parameters_atomically(
-        'controller', model=f'{file.parent}/./{file.name}', model_check_factor=0.0))
-    assert result.successful, result.reason
+    assert until_read(lambda: ros.set_parameters_atomically(
+        'controller', model=f'{file.parent}/./{file.name}', model_check_factor=0.0)).successful
     assert bench.reload()[0]
 
 
@@ -267,21 +266,19 @@ model_reload.load_suitable = slowly
 """
 
 
-def start_controller(ros: Harness, folder: Path, changes: str = '') -> tuple[Bench, Path]:
-    """Start a controller whose model, which is returned, is not slow yet."""
-    file = folder / 'model.safetensors'
-    put(model_path('reactor_nz4').read_bytes(), file)
+def start_controller(ros: Harness, file: Path, changes: str = '') -> Bench:
+    """Start a controller whose model is not slow yet."""
     ros.start('controller', {'model': file}, command=(
         sys.executable, '-c', f'{SLOW_DISK}{changes}\nsys.exit(controller.main())'))
-    return Bench(ros), file
+    return Bench(ros)
 
 
 def disk(file: Path) -> Path:
     return Path(f'{file}.disk')
 
 
-def test_the_loop_continues_while_a_slow_disk_is_read(ros: Harness, tmp_path: Path) -> None:
-    bench, file = start_controller(ros, tmp_path)
+def test_the_loop_continues_while_a_slow_disk_is_read(ros: Harness, file: Path) -> None:
+    bench = start_controller(ros, file)
     dead = file.with_name('dead.safetensors')
     for path in (file, dead):
         os.mkfifo(disk(path))
@@ -289,15 +286,14 @@ def test_the_loop_continues_while_a_slow_disk_is_read(ros: Harness, tmp_path: Pa
     reloaded = bench.ask_to_reload()
     # closing it lets the reader go on
     slow = opened(ros, disk(file))
-    (result,) = ros.set_parameters('controller', model=str(dead))
-    assert result.reason.startswith(f'the current model is kept: {dead} is still being read')
+    assert ros.set_parameters('controller', model=str(dead))[0].reason.startswith(
+        f'the current model is kept: {dead} is still being read')
     for _ in range(50):
         bench.measure()
     ros.wait_until(lambda: len(bench.commands) == 50)
     assert not reloaded.done()
     slow.close()
     ros.wait_until(reloaded.done)
-    assert reloaded.result().success
     assert 'n_z = 3' in reloaded.result().message
 
     # a node that is taken down while a file is read goes on when it is configured again
@@ -326,11 +322,9 @@ def test_the_loop_continues_while_a_slow_disk_is_read(ros: Harness, tmp_path: Pa
 
 
 def test_a_slow_trial_serves_the_next_attempt_unless_the_file_has_changed(
-        ros: Harness, tmp_path: Path, run_node: RunNode, monkeypatch: pytest.MonkeyPatch,
+        ros: Harness, file: Path, run_node: RunNode, monkeypatch: pytest.MonkeyPatch,
         capfd: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(model_reload, '_SHORT_WAIT', 0.0)
-    file = tmp_path / 'model.safetensors'
-    put(model_path('reactor_nz4').read_bytes(), file)
     run_node(ControllerNode, {'model': file})
     bench = Bench(ros)
 
@@ -347,10 +341,9 @@ def test_a_slow_trial_serves_the_next_attempt_unless_the_file_has_changed(
     ros.wait_until(lambda: f'model {file}: linear' in capfd.readouterr().err)
 
 
-def test_dead_disk_does_not_pile_up_readers(
-        ros: Harness, tmp_path: Path) -> None:
+def test_dead_disk_does_not_pile_up_readers(ros: Harness, file: Path) -> None:
     # impatient, or this would last
-    bench, file = start_controller(ros, tmp_path, 'model_reload._LONG_WAIT = 0.02')
+    bench = start_controller(ros, file, 'model_reload._LONG_WAIT = 0.02')
     others = [file.with_name(f'{k}.safetensors') for k in range(8)]
     for path in (file, *others):
         os.mkfifo(disk(path))

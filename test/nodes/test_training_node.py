@@ -37,13 +37,11 @@ def test_trains_from_a_bag_with_a_bar_on_the_terminal(ros: Harness, tmp_path: Pa
     printed = process.output()
     shares = [int(share) for share in re.findall(r'\|[#-]{30}\| +(\d+) %', printed)]
     assert shares == sorted(shares)
-    assert len(shares) > 3
+    assert len(set(shares)) > 3
     assert shares[-1] == 100
     assert 'estimating: drift of degree' in printed
-    assert re.search(r'the new model \(.+\) is accepted: its error on held-out data is 0\.\d+ '
-                     r'K, that of the current model \d\.\d+ K; written to '
-                     rf'{tmp_path}/new\.safetensors',
-                     printed)
+    assert re.search(r'the new model \(.+\) is accepted: .* 0\.\d+ K, that of the current model '
+                     rf'\d\.\d+ K; written to {tmp_path}/new\.safetensors', printed)
     assert {'new.json', 'new.md', 'new.safetensors'} == {
         path.name for path in tmp_path.glob('new.*') if 'alternative' not in path.name}
     assert load(tmp_path / 'new.safetensors').n_z == 2

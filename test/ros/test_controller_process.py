@@ -16,7 +16,6 @@ from rcl_interfaces.srv import DescribeParameters
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, Temperature
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from koopman_ros.core.units import LAST_STAMP_SECONDS
 from koopman_ros.demo import reactor
@@ -104,12 +103,6 @@ def test_every_parameter_is_described_with_unit_and_range(running: Harness) -> N
     assert weight.additional_constraints == '(0, 1e+12] 1/K^2'
 
 
-def measured(bench: Bench, first: int, count: int) -> list[float]:
-    """Measure once a second near the steady state; return the commands."""
-    return [bench.measure(STEADY + 0.05 * math.sin(0.3 * k), float(k)).temperature
-            for k in range(first, first + count)]
-
-
 def own_commands(bench: Bench, after: float) -> list[Temperature]:
     """Return what was commanded later than the last measurement."""
     return [message for message in bench.commands if seconds(message) > after]
@@ -120,7 +113,8 @@ def test_time_may_begin_at_zero_jump_by_an_hour_and_back_and_come_to_its_end(ros
     assert seconds(bench.commands[0]) == 0.0
     commands = [bench.commands[0].temperature]
     for first in (1, 3621, 26):
-        commands += measured(bench, first, 5)
+        commands += [bench.measure(STEADY + 0.05 * math.sin(0.3 * k), float(k)).temperature
+                     for k in range(first, first + 5)]
     assert np.max(np.abs(np.diff(commands))) < 0.05
     assert np.ptp(commands) > 0.0
     ros.wait_until(lambda: 'controller time is reset' in bench.process.output())
@@ -219,28 +213,6 @@ def test_silence_by_the_wall_clock_ends_at_the_safe_coolant_or_with_the_operator
     bench.status(lambda s: s.level == DiagnosticStatus.ERROR and (
         'no measurement for more than 0.3 s: manual mode' in s.message))
 
-    # stamps that cycle are a silence, too
-    ros.set_parameters('controller', measurement_timeout=0.5, hold_timeout=0.5,
-                       recovery_time=0.0)
-    ros.set_bool('controller/set_automatic', True)
-    begin, tenths = math.floor(seconds(bench.commands[-1])) + 60.0, itertools.cycle(range(10))
-    for k in range(10):
-        bench.measure(STEADY, begin + 0.1 * k)
-
-    def cycles(condition: Callable[[], object]) -> None:
-        def done() -> object:
-            bench.send(STEADY + 1.0, begin + 0.1 * next(tenths))
-            return condition()
-        ros.wait_until(done)
-
-    cycles(lambda: bench.commands[-1].temperature == 10.0)
-    cycles(lambda: (status := ros.last_status(STATUS)) and (
-        status.level == DiagnosticStatus.ERROR and 'have not advanced for more than 0.5 s: the '
-        'safe coolant is commanded' in status.message))
-    # one that advances again is answered by the law
-    bench.measure_until(lambda message: message.temperature != 10.0,
-                        seconds(bench.commands[-1]) + 1.0)
-
 
 def test_a_latched_safe_state_outlasts_silence_and_restart_until_it_is_cleared(
         ros: Harness, tmp_path: Path) -> None:
@@ -251,13 +223,11 @@ def test_a_latched_safe_state_outlasts_silence_and_restart_until_it_is_cleared(
     assert (value(found, 'safe state'), found.level) == ('latched', DiagnosticStatus.ERROR)
     assert bench.process.stop() == 0
     bench = Bench(ros, patience)
-    answer = ros.call(Trigger, 'controller/clear_safe_state', Trigger.Request())
-    assert not answer.success
-    assert 'the safe state was reached before the restart' in answer.message
+    assert 'reached before the restart' in ros.trigger('controller/clear_safe_state').message
     for k in range(2, 5):
         assert bench.measure(STEADY, float(k)).temperature < STEADY
     bench.status(lambda s: 'clear it on the panel or by the service' in s.message)
-    assert ros.call(Trigger, 'controller/clear_safe_state', Trigger.Request()).success
+    assert ros.trigger('controller/clear_safe_state').success
     bench.measure(STEADY, 5.0)
     assert value(bench.status(), 'active law') == 'learned law'
     ros.wait_until(lambda: not [*tmp_path.rglob('*.latched')])

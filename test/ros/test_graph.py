@@ -163,14 +163,11 @@ def test_policy_has_the_form_that_sros2_reads() -> None:
                 for enclave in root.findall('enclaves/enclave')}
     assert set(profiles) == {f'/koopman_ros/{name}' for name in (*PROGRAMS, 'operator')}
     for profile in profiles.values():
-        assert profile is not None
         for rules in profile:
             assert list(rules.attrib.values()) == ['ALLOW']
             assert len(rules) > 0
-    controller = profiles['/koopman_ros/controller']
-    assert controller is not None
-    assert {rule.text for rule in controller.findall("topics[@publish='ALLOW']/topic")} == set(
-        PROGRAMS['controller'].publishes)
+    published = profiles['/koopman_ros/controller'].findall("topics[@publish='ALLOW']/topic")
+    assert {rule.text for rule in published} == set(PROGRAMS['controller'].publishes)
 
 
 class Pair:

@@ -13,6 +13,7 @@ import subprocess
 import sys
 from types import ModuleType
 
+from builtin_interfaces.msg import Time
 import pytest
 from rclpy.utilities import get_rmw_implementation_identifier
 from rosgraph_msgs.msg import Clock
@@ -201,12 +202,9 @@ def test_impossible_time_does_not_end_a_node(
     run_node(controller.ControllerNode, {'use_sim_time': True})
     clock = ros.speak(Clock, '/clock', topics.CLOCK_QOS, to='controller')
     for sec, nanosec in ((-5, 0), (7, 4_000_000_000)):
-        message = Clock()
-        message.clock.sec, message.clock.nanosec = sec, nanosec
-        clock.publish(message)
+        clock.publish(Clock(clock=Time(sec=sec, nanosec=nanosec)))
         ros.meet('controller')
     assert 'ignored an invalid /clock message (sec -5, nanosec 0; ' in capfd.readouterr().err
-    # the true time is taken still
     clock.publish(Clock(clock=stamp_message(3 * NANOSECONDS)))
     ros.meet('controller')
 
