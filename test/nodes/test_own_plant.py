@@ -10,6 +10,7 @@ import shlex
 import shutil
 import sys
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,6 @@ from koopman_ros.testing import Harness
 from koopman_ros.testing.process import NodeProcess
 from support.installation import Installation, ROOT, run, underlay
 from support.nodes import run_here
-from support.quick_retraining import QUICK_TRAINER
 
 OVEN = ROOT / 'examples' / 'oven'
 PAGE = (ROOT / 'docs' / 'tutorials' / 'own_plant.md').read_text()
@@ -62,6 +62,16 @@ def start(ros: Harness, overlay: Installation, command: tuple[str, tuple[str, ..
         str(overlay.executables / node)))
 
 
+def train(ros: Harness, overlay: Installation, command: tuple[str, tuple[str, ...]],
+          setting: str) -> Any:
+    """Train as the page has it; return the errors of the lift and of the linear model, in K."""
+    process = start(ros, overlay, command, '-p', setting)
+    assert ros.wait_for_end(process) == 0, process.output()
+    said = re.search(ACCEPTED, process.output())
+    assert said, process.output()
+    return float(said[1]), float(said[2])
+
+
 @pytest.fixture(scope='module')
 def recorded(overlay: Installation, folder: Path, tmp_path_factory: pytest.TempPathFactory
              ) -> Path:
@@ -79,14 +89,9 @@ def recorded(overlay: Installation, folder: Path, tmp_path_factory: pytest.TempP
 def test_first_lift_is_accepted_and_brings_the_oven_to_its_set_point(
         overlay: Installation, folder: Path, recorded: Path, ros: Harness) -> None:
     assert summary(recorded).counts['/power_setpoint'] > 0
-    # quickly, but as the page has it
-    process = ros.start('trainer', {}, (*TRAIN[1], '-p', 'restarts:=1'), overlay.command(
-        str(overlay.python), '-c', QUICK_TRAINER))
-    assert ros.wait_for_end(process) == 0, process.output()
-    said = re.search(ACCEPTED, process.output())
-    assert said, process.output()
+    lift, linear = train(ros, overlay, TRAIN, 'restarts:=1')
     # the noise of the sensor is 0.2 K
-    assert float(said[1]) < 0.25 < 1.0 < float(said[2])
+    assert lift < 0.25 < 1.0 < linear
     model = load(folder / 'oven.safetensors')
     assert (model.provenance.plant, model.n_z) == ('oven', 2)
 
