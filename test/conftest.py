@@ -28,19 +28,19 @@ from support.disturbance import disturb_training
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 
 # What takes longest, first: where each core takes the next file, none is then idle at the end.
-LONGEST = ('test_browser', 'test_training_node', 'test_demo', 'test_unmeasured_states',
-           'test_studies', 'test_own_plant', 'test_panel', 'test_partly_measured',
-           'test_shipped_models', 'test_classes', 'test_several_states', 'test_parallel',
-           'test_examples', 'test_closed_loop_test', 'test_fault_campaign', 'test_replay',
-           'test_disturbance_observer', 'test_experiment_tanks', 'test_dead_time',
-           'test_laws', 'test_controller_process', 'test_processes', 'test_experiment_node',
-           'test_benchmarks', 'test_kalman_filters', 'test_simulate', 'test_server', 'test_player',
-           'test_closed_loop', 'test_learn', 'test_contained_failures', 'test_model_comparison',
-           'test_pipeline', 'test_reload', 'test_plant_node', 'test_graph', 'test_supervisor',
-           'test_recording', 'test_controller_node', 'test_portions', 'test_managed',
-           'test_grey_box', 'test_backends', 'test_bumpless', 'test_command_line',
-           'test_install_tree', 'test_parameter_ends', 'test_damage', 'test_estimates',
-           'test_acceptance', 'test_package')
+LONGEST = ('test_browser', 'test_demo', 'test_unmeasured_states', 'test_training_node',
+           'test_shipped_models', 'test_examples', 'test_own_plant', 'test_studies',
+           'test_classes', 'test_parallel', 'test_experiment_tanks', 'test_replay',
+           'test_kalman_filters', 'test_panel', 'test_c_code', 'test_lag', 'test_several_states',
+           'test_closed_loop_test', 'test_disturbance_observer', 'test_experiment_node',
+           'test_controller_process', 'test_reload', 'test_characteristics', 'test_benchmarks',
+           'test_controller_node', 'test_processes', 'test_server', 'test_acceptance',
+           'test_managed', 'test_player', 'test_pipeline', 'test_late_candidates',
+           'test_dead_time', 'test_recording', 'test_contained_failures', 'test_parameter_ends',
+           'test_law', 'test_fault_campaign', 'test_plant_node', 'test_install_tree',
+           'test_identify', 'test_simulate', 'test_supervisor', 'test_learn', 'test_non_affine',
+           'test_replay_job', 'test_measured_disturbances', 'test_partly_measured',
+           'test_backends', 'test_estimates')
 
 
 @pytest.hookimpl(hookwrapper=True)
