@@ -179,7 +179,10 @@ def over_interval(A: Array, B: Array, Q: Array, R: Array, interval: float
 
 
 def spectral_radius(M: Array) -> float:
-    """Return the largest size of an eigenvalue of a finite matrix (n, n)."""
+    """Return the largest size of an eigenvalue of a matrix (n, n); infinity if not finite."""
+    # LAPACK has no answer, or the wrong one
+    if not math.isfinite(_size(M)):
+        return math.inf
     # of so few numbers in a quarter of the time of numpy.linalg.eigvals
     real, imaginary, *_ = dgeev(M, compute_vl=0, compute_vr=0)
     return max(map(math.hypot, real.tolist(), imaginary.tolist()))

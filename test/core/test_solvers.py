@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag, expm, solve_continuous_are, solve_discrete_are
 
-from koopman_ros.core.solvers import over_interval, runge_kutta_step, solve_riccati
+from koopman_ros.core.solvers import (
+    over_interval,
+    runge_kutta_step,
+    solve_riccati,
+    spectral_radius,
+)
 from koopman_ros.core.status import StatusCode
 
 SIZES = [(n, m) for n in range(1, 9) for m in range(1, 4)]
@@ -296,3 +301,12 @@ def test_error_over_a_time_falls_with_the_fourth_power_of_the_step():
 
     # dx/dt = x^2 from 1/2 reaches 1 at 1
     assert (end(20) - 1.0) / (end(40) - 1.0) == pytest.approx(16.0, rel=0.1)
+
+
+@pytest.mark.parametrize('value', [np.nan, np.inf])
+@pytest.mark.parametrize('n', [2, 3])
+def test_a_matrix_that_is_not_finite_has_no_stable_eigenvalues(n, value):
+    for M in (np.full((n, n), value), np.diag([value, *[0.5] * (n - 1)]),
+              np.diag([*[0.5] * (n - 1), value])):
+        assert spectral_radius(M) == np.inf
+    assert spectral_radius(0.5 * np.eye(n)) == 0.5
