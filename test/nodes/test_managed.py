@@ -17,11 +17,10 @@ from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.demo import reactor
 from koopman_ros.event_log.records import parse, state_of
-from koopman_ros.nodes.controller import ControllerNode
 from koopman_ros.records import read_messages, summary
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, NodeProcess
-from support.controller_bench import PATIENT, reproduced, RunNode
+from support.controller_bench import reproduced
 from support.nodes import change, seconds, temperature, value
 
 
@@ -213,14 +212,15 @@ def test_controller(ros: Harness, tmp_path: Path) -> None:
     assert 'Traceback' not in process.output()
 
 
-def test_a_restarted_controller_continues_from_the_last_command(
-        ros: Harness, run_node: RunNode) -> None:
+def test_a_restarted_controller_continues_from_the_last_command(ros: Harness) -> None:
     """After an activation, by the records, too; an input that was measured long ago is none."""
     loop = Loop(ros)
     applied = ros.node.create_publisher(
         Temperature, reactor.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
     applied.publish(temperature(15.0, 1.0))
-    run_node(ControllerNode, PATIENT)
+    process = started(ros, 'controller', measurement_timeout=0.0)
+    assert change(ros, 'controller', 'configure')
+    assert change(ros, 'controller', 'activate')
     ros.meet('controller')
     ros.wait_until(loop.answered)
     assert ros.set_bool('controller/set_automatic', False).success
@@ -262,6 +262,8 @@ def test_a_restarted_controller_continues_from_the_last_command(
     assert loop.commands[count].temperature == pytest.approx(12.0, abs=1.0 + 1e-9)
     ros.wait_until(lambda: len(records) > 2)
     reproduced(records)
+    assert process.stop() == 0
+    assert 'Traceback' not in process.output()
 
 
 def test_trainer(ros: Harness, tmp_path: Path) -> None:
