@@ -25,6 +25,7 @@ from koopman_ros.ros.process import init
 
 T = TypeVar('T')
 _HISTORY = 100  # messages
+_ASK_AGAIN = 5.0  # s
 
 
 class CommandError(Exception):
@@ -92,9 +93,17 @@ def _wait(node: Node, seconds: float, found: Callable[[], T], missing: str) -> T
     return result
 
 
-def _answer(node: Node, seconds: float, future: Future, name: str) -> Any:
-    _wait(node, seconds, future.done, f'{name} did not respond within {seconds:g} s')
-    return future.result()
+def _repeated(node: Node, options: argparse.Namespace, ask: Callable[[], Future]) -> Any:
+    """Return the response to a request that may be repeated, since a busy server may lose one."""
+    sent: list[tuple[float, Future]] = []
+
+    def response() -> Any:
+        if not sent or time.monotonic() - sent[-1][0] > _ASK_AGAIN:
+            sent.append((time.monotonic(), ask()))
+        return next((future for _, future in sent if future.done()), None)
+
+    return _wait(node, options.timeout, response, (
+        f'{options.node} did not respond within {options.timeout:g} s')).result()
 
 
 def _kind(node: Node, options: argparse.Namespace) -> Any:
@@ -182,8 +191,10 @@ def _call(node: Node, options: argparse.Namespace) -> None:
         missing)[0])
     client = node.create_client(kind, service)
     _wait(node, options.timeout, client.service_is_ready, missing)
-    response = _answer(node, options.timeout, client.call_async(
-        _filled(kind.Request(), options.request)), service)
+    future = client.call_async(_filled(kind.Request(), options.request))
+    _wait(node, options.timeout, future.done,
+          f'{service} did not respond within {options.timeout:g} s')
+    response = future.result()
     _show(_plain(response))
     if not getattr(response, 'success', True):
         raise CommandError(f'{service} rejected')
@@ -195,11 +206,11 @@ def _parameter(node: Node, options: argparse.Namespace) -> None:
           f'no node {options.node}: check its name and the ROS domain')
 
     def read(names: list[str]) -> list[Any]:
-        return [parameter_value_to_python(value) for value in _answer(
-            node, options.timeout, client.get_parameters(names), options.node).values]
+        return [parameter_value_to_python(value) for value in _repeated(
+            node, options, lambda: client.get_parameters(names)).values]
 
     if options.name is None:
-        listed = _answer(node, options.timeout, client.list_parameters(), options.node)
+        listed = _repeated(node, options, client.list_parameters)
         names = sorted(listed.result.names)
         for name, value in zip(names, read(names), strict=True):
             print(f'{name}: {value}')
@@ -215,8 +226,8 @@ def _parameter(node: Node, options: argparse.Namespace) -> None:
         value = options.value
     elif isinstance(present[0], float) and isinstance(value, int):
         value = float(value)
-    result, = _answer(node, options.timeout, client.set_parameters(
-        [Parameter(options.name, value=value)]), options.node).results
+    result, = _repeated(node, options, lambda: client.set_parameters(
+        [Parameter(options.name, value=value)])).results
     if not result.successful:
         raise CommandError(result.reason)
 
