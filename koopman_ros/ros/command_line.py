@@ -22,6 +22,7 @@ import yaml
 from koopman_ros import __version__
 from koopman_ros.ros import topics
 from koopman_ros.ros.process import init
+from koopman_ros.ros.remote_node import repeated
 
 T = TypeVar('T')
 _HISTORY = 100  # messages
@@ -93,17 +94,11 @@ def _wait(node: Node, seconds: float, found: Callable[[], T], missing: str) -> T
     return result
 
 
-def _repeated(node: Node, options: argparse.Namespace, ask: Callable[[], Future]) -> Any:
-    """Return the response to a request that may be repeated, since a busy server may lose one."""
-    sent: list[tuple[float, Future]] = []
-
-    def response() -> Any:
-        if not sent or time.monotonic() - sent[-1][0] > _ASK_AGAIN:
-            sent.append((time.monotonic(), ask()))
-        return next((future for _, future in sent if future.done()), None)
-
-    return _wait(node, options.timeout, response, (
-        f'{options.node} did not respond within {options.timeout:g} s')).result()
+def _repeated(node: Node, options: argparse.Namespace, request: Callable[[], Future]) -> Any:
+    future = _wait(node, options.timeout, repeated(request, _ASK_AGAIN), (
+        f'{options.node} did not respond within {options.timeout:g} s'))
+    assert future is not None
+    return future.result()
 
 
 def _kind(node: Node, options: argparse.Namespace) -> Any:

@@ -27,6 +27,29 @@ _CHOICES = 'one of '  # at the beginning of the range of a choice
 _OF_RCLPY = ('qos_overrides', 'use_sim_time', 'start_type_description_service')
 
 
+def repeated(request: Callable[[], Future], period: float) -> Callable[[], Future | None]:
+    """
+    Return a function to be polled: it sends a request again each period until one is answered.
+
+    A server that does not know its client yet loses the response, so the request has to be one
+    that may be repeated.
+
+    :param period: in s.
+    :return: function that returns the future with the response, None before it has come.
+    """
+    sent: list[Future] = []
+    due = 0.0
+
+    def response() -> Future | None:
+        nonlocal due
+        if (now := time.monotonic()) >= due:
+            sent.append(request())
+            due = now + period
+        return next((future for future in sent if future.done()), None)
+
+    return response
+
+
 class RemoteNode:
     """
     Another node of a fixed name, which may come and go.

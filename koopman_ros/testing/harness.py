@@ -23,9 +23,9 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
-from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
+from koopman_ros.ros.remote_node import repeated
 from koopman_ros.ros.topics import DIAGNOSTICS, LOOP_QOS
 from koopman_ros.testing.process import given_domain, isolated_domain, NodeProcess
 
@@ -216,18 +216,8 @@ class Harness:
         # it learns of them in the order in which they were made: this call's come last
         client = self.node.create_client(GetParameters, f'{node}/get_parameters')
         self.wait_until(client.service_is_ready)
-        futures: list[Future] = []
-        due = 0.0
-
-        def answered() -> bool:
-            nonlocal due
-            # the response is lost when the node does not know the reader yet: ask again
-            if (now := time.monotonic()) >= due:
-                futures.append(client.call_async(GetParameters.Request(names=['use_sim_time'])))
-                due = now + _ASK_AGAIN
-            return any(future.done() for future in futures)
-
-        self.wait_until(answered)
+        self.wait_until(repeated(lambda: client.call_async(
+            GetParameters.Request(names=['use_sim_time'])), _ASK_AGAIN))
         self.node.destroy_client(client)
 
     # Services.

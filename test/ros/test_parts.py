@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from rclpy.duration import Duration
 from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.task import Future
 from rclpy.utilities import get_rmw_implementation_identifier
 from sensor_msgs.msg import Temperature
 
@@ -38,6 +39,7 @@ from koopman_ros.ros.controller_status import Counts, statuses
 from koopman_ros.ros.diagnostics import Severity
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.recorder import receipt_ns, Recorder
+from koopman_ros.ros.remote_node import repeated
 from koopman_ros.ros.signals import MeasuredInputs, SignalSample
 from koopman_ros.testing import Harness
 from support.nodes import temperature, TIMEOUT
@@ -254,3 +256,19 @@ def test_a_disturbance_at_its_bound_is_a_warning_of_the_model() -> None:
         report, estimate=report.estimate._replace(estimate=large))))
     assert (found['model'].level, found['control'].level) == (Severity.WARN,) * 2
     assert 'at its bound' in found['model'].message
+
+
+def test_a_request_is_repeated_until_one_is_answered() -> None:
+    sent: list[Future] = []
+
+    def request() -> Future:
+        sent.append(Future())
+        return sent[-1]
+
+    response = repeated(request, 60.0)
+    assert (response(), response(), len(sent)) == (None, None, 1)
+    response = repeated(request, 0.0)
+    assert (response(), response(), len(sent)) == (None, None, 3)
+    # the response to the one before the last is late
+    sent[1].set_result('late')
+    assert response() is sent[1]
