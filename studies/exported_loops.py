@@ -38,9 +38,9 @@ from koopman_ros.model import (
     LiftedModel,
     NetworkObservables,
     PolynomialObservables,
+    Provenance,
 )
 from koopman_ros.model.input_matrix import InputTerms
-from koopman_ros.model.lifted_model import Provenance
 from koopman_ros.model.training_data import TrainingStates, VerifiedLoops
 from koopman_ros.tuning import DisturbanceLimits, InputLimits, SensorLimits, Tuning
 

@@ -11,10 +11,10 @@ from koopman_ros.model.lifted_model import (
     LiftedModel,
     linearised_model,
     LONGEST_DEAD_TIME,
-    Provenance,
 )
 from koopman_ros.model.model_file import load, load_with_digest, ModelFileError, save
 from koopman_ros.model.observables import NetworkObservables, Observables, PolynomialObservables
+from koopman_ros.model.provenance import Provenance
 from koopman_ros.model.training_data import TrainingStates, VerifiedLoops
 
 __all__ = ['APPLIED', 'COMMANDED', 'LONGEST_DEAD_TIME', 'Box', 'Coordinates', 'InputTerms',

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -25,6 +25,7 @@ from koopman_ros.core.units import (
 from koopman_ros.model.coordinates import Coordinates, NO_SIGNALS
 from koopman_ros.model.input_matrix import InputTerms
 from koopman_ros.model.observables import NetworkObservables, Observables
+from koopman_ros.model.provenance import Provenance
 from koopman_ros.model.training_data import TrainingStates, VerifiedLoops
 from koopman_ros.model_classes import (
     FREE_LIFT,
@@ -52,42 +53,6 @@ _MAX_DRIFTS = 10_000
 _DIVERGED = 1e6
 # Of Gauss and Legendre on [0, 1].
 NODES, WEIGHTS = 0.5 * np.add(leggauss(5), [[1.0], [0.0]])
-
-
-@dataclass(frozen=True)
-class Provenance:
-    """
-    Origin of a model, its held-out figures and its acceptance.
-
-    :raises ValueError: for a rejection without a reason, or reasons without a verdict.
-    """
-
-    plant: str  #: name of the plant it was learned from
-    seed: int | None = None  #: seed of the training run, or None for a model that was not trained
-    data_digest: str = ''  #: SHA-256 of the training samples, in hexadecimal
-    #: held-out figures: ``rw``, ``rx`` and ``cond`` without unit, ``rollout_rmse`` in state units;
-    #: from measured data also ``noise`` in state units and ``coverage``, the visited share of the
-    #: training box
-    metrics: Mapping[str, float] = field(default_factory=dict)
-    package_version: str = ''  #: version of koopman_ros that made it
-    method: str = ''  #: how derivatives were found; empty where they were given
-    #: one of :data:`koopman_ros.model_classes.CLASSES`, or empty where training did not state it
-    model_class: str = ''
-    accepted: bool | None = None  #: verdict of the acceptance test; None if not tested
-    reasons: tuple[str, ...] = ()  #: for the verdict; at least one for a rejection
-    closed_loops: str = ''  #: result of simulated closed loops, with its confidence
-
-    def __post_init__(self) -> None:
-        if bool(self.reasons) < (self.accepted is False) or bool(self.reasons) > (
-                self.accepted is not None):
-            raise ValueError(f'accepted = {self.accepted} contradicts the reasons '
-                             f'{list(self.reasons)}')
-
-    @property
-    def acceptance(self) -> str:
-        """The verdict in words, with the reasons."""
-        verdict = {True: 'accepted', False: 'rejected', None: 'not tested'}[self.accepted]
-        return f'{verdict} ({"; ".join(self.reasons)})' if self.reasons else verdict
 
 
 @dataclass(frozen=True)

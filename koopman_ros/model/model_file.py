@@ -21,8 +21,9 @@ from koopman_ros.core.paths import write_atomically
 from koopman_ros.core.units import check_unit
 from koopman_ros.model.coordinates import Coordinates, NO_SIGNALS
 from koopman_ros.model.input_matrix import InputTerms
-from koopman_ros.model.lifted_model import LiftedModel, Provenance
+from koopman_ros.model.lifted_model import LiftedModel
 from koopman_ros.model.observables import NetworkObservables, PolynomialObservables
+from koopman_ros.model.provenance import Provenance
 from koopman_ros.model.training_data import TrainingStates, VerifiedLoops
 from koopman_ros.model_classes import CLASSES
 
