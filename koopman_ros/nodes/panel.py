@@ -334,10 +334,10 @@ class PanelNode(LoopNode):
             reply(answer)
 
         # as the controller reads the value from the message
-        to_si, from_si = conversion(unit, place.unit), conversion(place.unit, unit)
+        to_field, from_field = conversion(unit, place.unit), conversion(place.unit, unit)
         self._requests.add(SETPOINT if setpoint else MANUAL, name,
-                           float(from_si(float(to_si(own)))),
-                           time.monotonic(), on_answer, accepted)
+                           float(from_field(float(to_field(own)))), time.monotonic(), on_answer,
+                           accepted)
 
     def _rejection(self, codes: Sequence[str], name: str, value: float) -> str:
         """Write the reason of a rejected set-point; '' if only the controller knows it."""

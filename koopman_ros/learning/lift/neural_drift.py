@@ -52,13 +52,13 @@ def with_units_of(drift: LiftedModel, lift: LiftedModel) -> LiftedModel:
 
     :raises ValueError: for a model without a network.
     """
-    linear, neural = lift.observables, drift.observables
-    if not (isinstance(linear, NetworkObservables) and isinstance(neural, NetworkObservables)):
+    own, added = lift.observables, drift.observables
+    if not (isinstance(own, NetworkObservables) and isinstance(added, NetworkObservables)):
         raise ValueError('only a network has hidden units')
-    idle = np.zeros((len(linear.V), len(neural.W)))
+    idle = np.zeros((len(own.V), len(added.W)))
     return replace(lift, readout=None, observables=replace(
-        linear, W=np.vstack([linear.W, neural.W]), b=np.concatenate([linear.b, neural.b]),
-        V=np.hstack([linear.V, idle])))
+        own, W=np.vstack([own.W, added.W]), b=np.concatenate([own.b, added.b]),
+        V=np.hstack([own.V, idle])))
 
 
 @dataclass(frozen=True)
