@@ -24,8 +24,8 @@ from koopman_ros.model import load, save
 from koopman_ros.nodes.controller import ControllerNode
 from koopman_ros.ros import signals, topics
 from koopman_ros.testing import Harness
-from support.controller_bench import Bench, reproduced, RunNode, STATUS, STEADY, until_read
-from support.nodes import seconds, temperature, value
+from support.controller_bench import Bench, reproduced, STATUS, STEADY, until_read
+from support.nodes import RunNode, seconds, temperature, value
 
 
 @pytest.fixture(scope='module')

@@ -18,7 +18,7 @@ from koopman_ros.nodes.trainer import TrainerNode
 from koopman_ros.ros import topics
 from koopman_ros.ros.time_conversion import stamp_message
 from koopman_ros.testing import Harness
-from support.controller_bench import RunNode
+from support.nodes import RunNode
 from support.tanks import LEVELS, linear, PUMPS, TANKS
 
 STATUS, SERVICE = 'trainer: experiment', 'trainer/experiment'

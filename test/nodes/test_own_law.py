@@ -10,8 +10,8 @@ import pytest
 
 from koopman_ros.nodes import controller
 from koopman_ros.testing import Harness
-from support.controller_bench import Bench, PURE, RunNode, STATUS, STEADY
-from support.nodes import complaint, run_here, value
+from support.controller_bench import Bench, PURE, STATUS, STEADY
+from support.nodes import complaint, run_here, RunNode, value
 
 LAWS = """
 from dataclasses import dataclass

@@ -195,7 +195,7 @@ def test_trainer_steps_with_every_parameter_of_the_experiment_at_its_ends(ros: H
 
 def test_trainer_rejects_names_that_cannot_be_topics(ros: Harness) -> None:
     with running(ros, TrainerNode, {'record_at_start': False}) as node:
-        for name, words in (('{nobody}', 'unknown substitution'),
+        for name, words in (('{pump}', 'unknown substitution'),
                             ('a//b', 'topic name must not contain'),
                             ('x' * 5000, 'topic length should not exceed')):
             result = node.set_parameters_atomically([Parameter('topics', value=[name])])
@@ -205,5 +205,5 @@ def test_trainer_rejects_names_that_cannot_be_topics(ros: Harness) -> None:
             assert len(result.reason) < 250
     with (pytest.raises(ConfigurationError, match='unknown substitution'),
           running(ros, TrainerNode, {
-              'record_at_start': False, 'topics': "['{nobody}']"})):
+              'record_at_start': False, 'topics': "['{pump}']"})):
         pass

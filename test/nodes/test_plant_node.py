@@ -26,8 +26,7 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.simulated_plant import Analyser
 from koopman_ros.ros.time_conversion import stamp_nanoseconds
 from koopman_ros.testing import Harness
-from support.controller_bench import RunNode
-from support.nodes import seconds, temperature, value
+from support.nodes import RunNode, seconds, temperature, value
 
 STATUS = 'plant: simulation'
 NOMINAL_COOLANT = 26.85  # degC

@@ -30,8 +30,7 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.recording import free_name
 from koopman_ros.ros.time_conversion import stamp_message
 from koopman_ros.testing import Harness
-from support.controller_bench import RunNode
-from support.nodes import complaint, run_here, temperature, TIMEOUT
+from support.nodes import complaint, run_here, RunNode, temperature, TIMEOUT
 
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 TOPIC = '/temperature'

@@ -25,8 +25,8 @@ from koopman_ros.nodes.plant import PlantNode
 from koopman_ros.ros import topics
 from koopman_ros.ros.node import range_of
 from koopman_ros.testing import Harness
-from support.controller_bench import Bench, reproduced, RunNode, STATUS, STEADY, TABLE
-from support.nodes import seconds, temperature, value
+from support.controller_bench import Bench, reproduced, STATUS, STEADY, TABLE
+from support.nodes import RunNode, seconds, temperature, value
 
 CONTROLLER = '/controller'
 SAFE = 5.0  # degC

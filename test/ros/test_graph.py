@@ -33,8 +33,7 @@ from koopman_ros.ros.hosted import HostedNode
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.node_descriptions import OPERATOR, policy, Program, PROGRAMS, programs
 from koopman_ros.testing import Harness
-from support.controller_bench import RunNode
-from support.nodes import temperature
+from support.nodes import RunNode, temperature
 
 Seen = dict[str, set[str]]
 BEST_EFFORT = QoSProfile(depth=1, reliability=qos.ReliabilityPolicy.BEST_EFFORT)

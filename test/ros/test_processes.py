@@ -29,8 +29,7 @@ from koopman_ros.ros.node_descriptions import tables
 from koopman_ros.ros.process import answer, open_to_the_network
 from koopman_ros.ros.time_conversion import stamp_message
 from koopman_ros.testing import Harness, NodeProcess
-from support.controller_bench import RunNode
-from support.nodes import run_here, TIMEOUT
+from support.nodes import run_here, RunNode, TIMEOUT
 
 TABLES = tables()
 

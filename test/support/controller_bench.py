@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A controller as a process, with a thermometer and an operator in the test."""
+"""A controller, with a thermometer and an operator in the test."""
 
 from collections.abc import Callable, Mapping, Sequence
 import math
@@ -23,11 +23,9 @@ from koopman_ros.model import load
 from koopman_ros.nodes.controller import ControllerNode
 from koopman_ros.parameters.controller import table_of
 from koopman_ros.ros import topics
-from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.testing import Harness
-from support.nodes import seconds, temperature, TIMEOUT, value
+from support.nodes import RunNode, seconds, temperature, TIMEOUT, value
 
-RunNode = Callable[..., ManagedNode]
 STATUS = 'controller: control'
 TABLE = table_of(load(model_path(reactor.MODEL)))
 STEADY = 51.8  # degC, near the plant's steady state

@@ -26,6 +26,7 @@ from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.time_conversion import stamp_message, stamp_nanoseconds
 from koopman_ros.testing import Harness, isolated_domain
 
+RunNode = Callable[..., ManagedNode]
 TIMEOUT = 120.0  # s; a test that waits this long has failed, on a busy machine, too
 
 
@@ -83,7 +84,7 @@ def running(ros: Harness, create: Callable[..., ManagedNode], parameters: Mappin
 
 
 @pytest.fixture
-def run_node(ros: Harness) -> Iterator[Callable[..., ManagedNode]]:
+def run_node(ros: Harness) -> Iterator[RunNode]:
     """Yield a function that runs a node in the thread of the test, until the end."""
     with contextlib.ExitStack() as stack:
         yield lambda *given: stack.enter_context(running(ros, *given))
