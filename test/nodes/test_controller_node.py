@@ -143,7 +143,8 @@ def test_manual_mode_sends_the_command_of_the_operator(bench: Bench) -> None:
     bench.status(lambda s: s.level == DiagnosticStatus.WARN and 'switch to manual' in s.message)
     assert bench.measure(STEADY, at + 1.0).temperature == pytest.approx(held, abs=1e-6)
 
-    assert bench.ros.set_bool('controller/set_automatic', False).message == 'manual mode'
+    response = bench.ros.set_bool('controller/set_automatic', False)
+    assert (response.success, response.message) == (True, 'manual mode')
     held = bench.measure(STEADY, at + 2.0).temperature
     assert bench.measure(STEADY + 1.0, at + 3.0).temperature == held
     manual.publish(temperature(20.0))

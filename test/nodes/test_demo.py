@@ -64,6 +64,7 @@ def test_a_measured_step_of_the_feed_peaks_at_a_third_of_an_unmeasured_one_or_le
     result = json.loads((tmp_path / 'summary.json').read_text())
     assert result['peak_unmeasured_kelvin'] == pytest.approx(0.91, abs=0.1)
     assert result['peak_ratio'] < 1.0 / 3.0
+    assert result['peak_measured_kelvin'] < 0.25
     assert (tmp_path / 'disturbance.png').read_bytes().startswith(b'\x89PNG')
     # the records of the loop give its commands again
     replayed = replay_records(
@@ -129,7 +130,9 @@ def test_demo_commands_nothing_in_a_domain_with_another_loop(
     assert "'mine'" in capsys.readouterr().err
 
 
-def test_demo_interrupted_while_it_loads_ends_without_a_word(tmp_path: Path) -> None:
+@pytest.mark.parametrize('which', [[], ['retrain']])
+def test_demo_interrupted_while_it_loads_ends_without_a_word(
+        tmp_path: Path, which: list[str]) -> None:
     program = (
         'import os, runpy, signal, sys\n'
         'class Interrupted:\n'
@@ -138,7 +141,7 @@ def test_demo_interrupted_while_it_loads_ends_without_a_word(tmp_path: Path) -> 
         '            os.kill(os.getpid(), signal.SIGINT)\n'
         'sys.meta_path.insert(0, Interrupted())\n'
         'runpy.run_module("koopman_ros.demo", run_name="__main__", alter_sys=True)\n')
-    done = subprocess.run([sys.executable, '-c', program, '--output', tmp_path],
+    done = subprocess.run([sys.executable, '-c', program, *which, '--output', tmp_path],
                           capture_output=True, text=True, timeout=120, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
 

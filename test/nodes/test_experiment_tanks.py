@@ -92,7 +92,8 @@ def test_setpoints_step_and_return_to_their_previous_values(ros: Harness, tmp_pa
 
     # one that the controller rejects
     assert ros.set_bool(SERVICE, False).success
-    ros.set_parameters('trainer', experiment_length=60000.0, **{'level_2.setpoint_max': 5.0})
+    assert all(result.successful for result in ros.set_parameters(
+        'trainer', experiment_length=60000.0, **{'level_2.setpoint_max': 5.0}))
     assert ros.set_bool(SERVICE, True).success
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
     assert re.fullmatch(r'aborted: the controller tracks [0-9.]+ m instead of the requested [0-9.]'
@@ -100,7 +101,8 @@ def test_setpoints_step_and_return_to_their_previous_values(ros: Harness, tmp_pa
     ros.wait_until(lambda: ros.node.count_publishers(f'{LEVELS[0]}/setpoint') == 0)
 
     # in manual mode it moves nothing
-    ros.set_parameters('trainer', **{'level_2.setpoint_max': float(high[1])})
+    assert ros.set_parameters(
+        'trainer', **{'level_2.setpoint_max': float(high[1])})[0].successful
     assert ros.set_bool(SERVICE, True).success
     ros.set_bool('controller/set_automatic', False)
     words = 'the controller is in manual mode: switch it to automatic mode'

@@ -178,7 +178,10 @@ def test_program_of_which_no_loop_is_left_ends(
         tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'loops.txt').write_text('a\nb')
     loops = ('--', '--loops', str(tmp_path / 'loops.txt'))
-    for given, words, count in ((('-p', 'model:=nowhere.safetensors'), 'no model file at nowh', 2),
-                                (('-r', '__ns:=/elsewhere'), 'would apply to all loops', 1)):
+    for given, words, count in (
+            (('-p', 'model:=nowhere.safetensors'),
+             'cannot start: no model file at nowhere.safetensors', 2),
+            (('-r', '__ns:=/elsewhere'),
+             'controller: cannot start: -r __ns:=/elsewhere would apply to all loops', 1)):
         assert run_here(controller, *given, *loops) == 1
         assert capfd.readouterr().err.count(words) == count

@@ -64,8 +64,9 @@ def test_a_law_acts_by_its_own_parameters_when_the_one_before_raises(
     assert set_parameters('controller', **{
         'Proportional.coolant_temperature.bias': 0.25}).successful
     assert bench.measure(STEADY + 0.5, 5.0).temperature == pytest.approx(at_rest - 0.25, abs=0.02)
-    assert 'Proportional.gain = 51.0' in set_parameters(
-        'controller', **{'Proportional.gain': 51.0}).reason
+    rejected = set_parameters('controller', **{'Proportional.gain': 51.0})
+    assert not rejected.successful
+    assert 'Proportional.gain = 51.0' in rejected.reason
     status = ros.wait_for_status(STATUS, lambda s: 'KeyError' in s.message)
     assert (status.level, value(status, 'active law')) == (
         DiagnosticStatus.WARN, 'own_laws:Proportional')

@@ -68,11 +68,11 @@ def say_until(ros: Harness, publisher: Publisher, condition: Callable[[list[floa
     return sent
 
 
-def test_kill_loses_no_more_than_the_last_second(ros: Harness, tmp_path: Path) -> None:
-    """Of the second part of a bag, which has been written for longer than a second."""
+@pytest.mark.parametrize(('split', 'files'), [({}, 1), ({'max_bag_duration': 0.4}, 3)])
+def test_kill_loses_no_more_than_the_last_second(
+        ros: Harness, tmp_path: Path, split: dict[str, object], files: int) -> None:
     bag = tmp_path / 'run'
-    process = ros.start('trainer', {
-        'output': bag, 'compression': 'zstd', 'max_bag_duration': 1.5})
+    process = ros.start('trainer', {'output': bag, 'compression': 'zstd', **split})
     publisher = ros.speak(Temperature, reactor.TEMPERATURE, to='trainer')
     counted: list[tuple[float, int]] = [(0.0, 0)]  # s by the clock, and messages in a status
 
@@ -86,7 +86,7 @@ def test_kill_loses_no_more_than_the_last_second(ros: Harness, tmp_path: Path) -
         return max(count for at, count in counted if at < now - 1.0)
 
     sent = say_until(
-        ros, publisher, lambda sent: safe() >= 150 and len(list(bag.glob('*.mcap'))) >= 2)
+        ros, publisher, lambda _: safe() >= 150 and len(list(bag.glob('*.mcap'))) >= files)
     least = safe()
     assert process.stop(signal.SIGKILL) == -signal.SIGKILL
     found = values(list(read_messages(bag, [TOPIC], recover=True)))
@@ -188,9 +188,13 @@ def test_too_little_room_stops_the_recording_alone(shared: Harness, tmp_path: Pa
     assert values(recorded(bag)) == list(range(900))
     ros.node.destroy_publisher(publisher)
 
-    assert 'less than min_free_disk' in ros.set_bool('trainer/record', True).message
+    rejected = ros.set_bool('trainer/record', True)
+    assert not rejected.success
+    assert 'less than min_free_disk = 1000000000 MB: free some space' in rejected.message
     ros.set_parameters('trainer', min_free_disk=0.0)
-    assert str(tmp_path / 'run_2') in ros.set_bool('trainer/record', True).message
+    again = ros.set_bool('trainer/record', True)
+    assert again.success
+    assert str(tmp_path / 'run_2') in again.message
     ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
     assert ros.set_bool('trainer/record', False).success
 

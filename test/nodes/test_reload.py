@@ -294,6 +294,7 @@ def test_the_loop_continues_while_a_slow_disk_is_read(ros: Harness, file: Path) 
     assert not reloaded.done()
     slow.close()
     ros.wait_until(reloaded.done)
+    assert reloaded.result().success
     assert 'n_z = 3' in reloaded.result().message
 
     # a node that is taken down while a file is read goes on when it is configured again

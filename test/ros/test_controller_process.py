@@ -213,6 +213,28 @@ def test_silence_by_the_wall_clock_ends_at_the_safe_coolant_or_with_the_operator
     bench.status(lambda s: s.level == DiagnosticStatus.ERROR and (
         'no measurement for more than 0.3 s: manual mode' in s.message))
 
+    # stamps that cycle are a silence, too
+    ros.set_parameters('controller', measurement_timeout=0.5, hold_timeout=0.5,
+                       recovery_time=0.0)
+    ros.set_bool('controller/set_automatic', True)
+    begin, tenths = math.floor(seconds(bench.commands[-1])) + 60.0, itertools.cycle(range(10))
+    for k in range(10):
+        bench.measure(STEADY, begin + 0.1 * k)
+
+    def cycles(condition: Callable[[], object]) -> None:
+        def done() -> object:
+            bench.send(STEADY + 1.0, begin + 0.1 * next(tenths))
+            return condition()
+        ros.wait_until(done)
+
+    cycles(lambda: bench.commands[-1].temperature == 10.0)
+    cycles(lambda: (status := ros.last_status(STATUS)) and (
+        status.level == DiagnosticStatus.ERROR and 'have not advanced for more than 0.5 s: the '
+        'safe coolant is commanded' in status.message))
+    # one that advances again is answered by the law
+    bench.measure_until(lambda message: message.temperature != 10.0,
+                        seconds(bench.commands[-1]) + 1.0)
+
 
 def test_a_latched_safe_state_outlasts_silence_and_restart_until_it_is_cleared(
         ros: Harness, tmp_path: Path) -> None:
@@ -223,7 +245,9 @@ def test_a_latched_safe_state_outlasts_silence_and_restart_until_it_is_cleared(
     assert (value(found, 'safe state'), found.level) == ('latched', DiagnosticStatus.ERROR)
     assert bench.process.stop() == 0
     bench = Bench(ros, patience)
-    assert 'reached before the restart' in ros.trigger('controller/clear_safe_state').message
+    answer = ros.trigger('controller/clear_safe_state')
+    assert not answer.success
+    assert 'the safe state was reached before the restart' in answer.message
     for k in range(2, 5):
         assert bench.measure(STEADY, float(k)).temperature < STEADY
     bench.status(lambda s: 'clear it on the panel or by the service' in s.message)
