@@ -3,6 +3,8 @@
 
 """Services and parameters of another node, called without waiting."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 import math
 import time
