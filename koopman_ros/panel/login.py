@@ -97,6 +97,10 @@ def add_login(app: FastAPI, source: Source, keeper: AccessControl) -> None:
         request.session[_ID] = keeper.sessions.open(name, role)
         return RedirectResponse(page if page in TABS else '/', 303)
 
+    @app.get('/session', status_code=204)
+    def session() -> None:
+        """Respond to a user who is logged in; to others, no address but that to log in does."""
+
     @app.get('/logout', response_model=None)
     def log_out(request: Request) -> Response:
         keeper.sessions.close(keeper.session_id(request.scope))

@@ -453,7 +453,9 @@ def test_a_viewer_on_a_phone_sees_operator_actions_and_cannot_act(site: Site) ->
             if path != '/trends':
                 controls = page.locator('.page button, .page input')
                 assert controls.evaluate_all(USABLE) == []
-        # logged out in another page
+        # logged out in another page, while this one is connected
+        beat = page.locator('#beat')
+        expect(beat).not_to_have_attribute('data-beat', beat.get_attribute('data-beat') or '')
         assert phone.request.get(f'{site.url}/logout').ok
         page.wait_for_url(re.compile(r'/login\?page=/tuning$'))
 

@@ -15,13 +15,14 @@ from pathlib import Path
 import re
 import resource
 import socket
+import threading
 import time
 from typing import NamedTuple
 from urllib.parse import urlencode
 
 from nicegui import Client
 import numpy as np
-from playwright.sync_api import expect, Page
+from playwright.sync_api import expect, Page, WebSocketRoute
 import pytest
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
@@ -31,7 +32,7 @@ from koopman_ros.panel.connections import Listener, RateLimiter
 from koopman_ros.panel.server import PanelServer
 from koopman_ros.panel.trend_chart import axis_ends, ink, legend_rows, zoomed
 from koopman_ros.panel.trend_page import time_of_day
-from support.browser import opened_browser, Pages
+from support.browser import opened_browser, Pages, PATIENCE
 from support.hostile import HostileSource, NOW, TEXTS
 from support.users import PASSWORDS, write_users
 
@@ -372,6 +373,32 @@ def test_no_text_from_outside_runs_in_the_browser(site: Site, browser: Pages) ->
                 page.get_by_role('button', name='Train').click()
                 expect(page.get_by_text(f'rejected: {TEXTS[0]}').first).to_be_visible()
             assert page.evaluate('window.CAUGHT') is None, path
+        browser.forgive()
+
+
+def test_a_page_without_connection_whose_session_ends_asks_to_log_in(
+        site: Site, browser: Pages) -> None:
+    with browser.page('about:blank') as page:
+        log_in(page, site)
+        # its connection reaches the panel only after the session has ended
+        ended = threading.Event()
+        waiting: list[WebSocketRoute] = []
+
+        def route(attempt: WebSocketRoute) -> None:
+            if ended.is_set():
+                attempt.connect_to_server()
+            else:
+                waiting.append(attempt)
+
+        page.route_web_socket('**', route)
+        page.goto(f'{site.url}/tuning')
+        expect(page.locator('#lost')).to_contain_text(
+            'no message from the panel', timeout=PATIENCE)
+        assert page.request.get(f'{site.url}/session').status == 204
+        assert page.request.get(f'{site.url}/logout').ok
+        ended.set()
+        waiting[0].connect_to_server()
+        page.wait_for_url(f'{site.url}/login?page=/tuning')
         browser.forgive()
 
 
