@@ -20,6 +20,8 @@ from koopman_ros.core.units import check_time_unit, checked_signals
 __all__ = ['DriftSamples', 'Episode', 'PlantDescription', 'averaged', 'cut',
            'sample_interval', 'split_by_episode', 'within']
 
+_ROUNDING = 1e-6  # share of a sample interval within which two times are equal
+
 
 @dataclass(frozen=True)
 class PlantDescription:
@@ -194,6 +196,10 @@ class Episode:
         if not np.any(dead_time):
             return self
         shifted = self.input_time[:, None] + dead_time
+        # a change at a measurement stays there, whatever the rounding
+        near = _ROUNDING * np.min(np.diff(self.time), initial=np.inf)
+        at = self.time[np.minimum(np.searchsorted(self.time, shifted - near), len(self) - 1)]
+        shifted = np.where(np.abs(shifted - at) <= near, at, shifted)
         first = np.searchsorted(self.time, shifted[0].max())
         if len(self) - first < 2:
             return None

@@ -43,6 +43,8 @@ _RATIO, _SHARE, _TOLERANCE = 2.0, 30.0, 0.05
 _DEGREE, _MOST_COEFFICIENTS, _WINDOW = 3, 60, 40
 # Samples of a segment that is simulated.
 _SAMPLES = 240
+# Share of a lag within which two times are equal.
+_ROUNDING = 1e-6
 # Share of a lag within which a command that is a state changes in a record.
 _RAMP = 1e-3
 
@@ -67,6 +69,8 @@ def lagged(episode: Episode, lag: Array, longest: float = 0.0) -> Episode | None
         later = begin[:, None] + seconds * _KNOTS
         times.append(later[later < end[:, None]])
     knots = np.unique(np.concatenate(times))
+    # of two that are equal but for rounding, the later one
+    knots = knots[np.append(np.diff(knots) > _ROUNDING * np.min(lag[lag > 0.0]), True)]
     u, linear = episode.inputs_at(knots), list(episode.linear) or [False] * len(lag)
     for j in np.flatnonzero(lag):
         value, applied = u[0, j], [u[0, j]]
@@ -238,7 +242,7 @@ def find_lags(plant: PlantDescription, episodes: Sequence[Episode], lag: Array,
     than two standard errors of the difference, over segments of the record.
 
     :param lag: (n_u,) those that are known, in time units.
-    :param sought: indices of the inputs whose lag is to be found.
+    :param searched: indices of the inputs whose lag is to be found.
     :param watch: called now and then; it may raise to end the search.
     """
     lag = lag.copy()

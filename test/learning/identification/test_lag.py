@@ -84,6 +84,20 @@ def test_the_applied_inputs_are_states_and_the_commands_the_inputs():
     np.testing.assert_allclose(drift.scaled_input_matrix(xi), both[:, 2:], atol=1e-6)
 
 
+@pytest.mark.parametrize('interval', [0.1, 1.0 / 60.0, 0.7])
+def test_commands_behind_a_lag_are_those_of_the_record_whatever_the_rounding(interval):
+    episode, lag = record([5.0], noise=0.0)[0], np.array([5.0 * interval])
+    late = replace(episode, time=interval * episode.time, input_time=interval * episode.time
+                   ).delayed(np.array([3.0 * interval]))
+    # what changes at a measurement acts from there on
+    np.testing.assert_array_equal(late.inputs_at(late.time), episode.u[:-3])
+    found = with_lag(identify(plant_of(1), [lagged(late, lag)], degrees=(1,), methods=methods(20)),
+                     lag)
+    for part in (*found.fitted, *found.held_out):
+        middle = part.input_time[:-1] + 0.5 * np.diff(part.input_time)
+        np.testing.assert_allclose(part.u[:-1], late.inputs_at(middle), atol=1e-9)
+
+
 def test_a_lag_is_found_and_none_where_there_is_none():
     lags = np.array([5.0, 0.0])
     found = find_lags(plant_of(2), [record(lags, 400)[0]], np.zeros(2), range(2))
