@@ -100,8 +100,9 @@ def test_a_measured_disturbance_is_learned_and_keeps_its_role(folder, capsys):
         rain, 5), 'level [m]': level + 1e-3 * rng.standard_normal(N)}).to_csv(
             'day.csv', index=False)
     assert learned('--disturbances', 'rain') == 0
-    model = load(folder / 'day.safetensors')
-    assert (model.inputs.names, model.disturbances.names) == (('pump',), ('rain',))
+    for name in ('day.alternative_1', 'day'):
+        model = load(folder / f'{name}.safetensors')
+        assert (model.inputs.names, model.disturbances.names) == (('pump',), ('rain',))
     effect = model.E * model.states.scale / model.disturbances.scale
     assert effect == pytest.approx(0.16, rel=0.02)
     assert model.dead_time == pytest.approx(0.0)

@@ -148,11 +148,13 @@ def _estimated(found: Identified, plant: PlantDescription) -> tuple[PlantDescrip
                        drift.input_matrix)), samples
 
 
-def alternative_models(found: Identified, plant: PlantDescription) -> list[LiftedModel]:
+def alternative_models(found: Identified, plant: PlantDescription, dead_time: Array
+                       ) -> list[LiftedModel]:
     """
     Return models of the alternative polynomial drifts of an identification.
 
     :param plant: as for :func:`learn_lift`.
+    :param dead_time: (n_u,) of the inputs, in s.
     """
     models = []
     for drift in found.alternatives:
@@ -163,7 +165,8 @@ def alternative_models(found: Identified, plant: PlantDescription) -> list[Lifte
         with contextlib.suppress(ValueError, np.linalg.LinAlgError):
             if isinstance(own, DriftModel):
                 known, samples = _estimated(replace(found, drift=drift), plant)
-                model = Edmd(own.degree).learn(known, samples)
+                model = replace(Edmd(own.degree).learn(known, samples), dead_time=dead_time
+                                ).with_disturbances(plant.disturbance_names)
                 model_file.check(model)
                 models.append(model)
     return models

@@ -151,9 +151,8 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     save(model, path)
     return replace(bare, learned=learned.with_model(model), decision=decision,
                    reasons=decision.reasons, model_file=str(path), free_runs=runs,
-                   compared_runs=others, alternative_files=_save_alternatives(Path(task.output), [
-                       replace(one, dead_time=dead_time)
-                       for one in alternative_models(found, plant)]))
+                   compared_runs=others, alternative_files=_save_alternatives(
+                       Path(task.output), alternative_models(found, plant, dead_time)))
 
 
 def _save_alternatives(output: Path, models: Sequence[LiftedModel]) -> tuple[str, ...]:

@@ -141,8 +141,7 @@ class ControllerNode(ManagedNode):
         self._measurements = Measurements(
             self, endpoints, wiring, exclusive, self._settings, self._answer)
         self._requests = OperatorRequests(
-            self, endpoints, wiring, self._loop, self._measurements.applied,
-            lambda: self._diagnostics.publish_if_changed())
+            self, endpoints, wiring, self._loop, self._measurements.applied, self._report_status)
         # a group of its own, or measurements would wait until a model is read
         self.create_service(Trigger, '~/reload_model', self._models.on_reload,
                             callback_group=MutuallyExclusiveCallbackGroup())
@@ -243,7 +242,7 @@ class ControllerNode(ManagedNode):
         if self.active:
             self._latch.update(self._loop.state.supervisor.latched)
         if self._status_pending:
-            self._publish_status(self._report, time.monotonic())
+            self._report_status()
         with self._loop.lock:
             self._records.watch()
 
@@ -282,17 +281,16 @@ class ControllerNode(ManagedNode):
         if report.measurement.clock_went_back:
             self.get_logger().warning('the stamp of the measurement jumped back by more than 1 s: '
                                       'controller time is reset', throttle_duration_sec=1.0)
-        # of many measurements within PERIOD the status shows the first, and then the last
-        until, *shown = self._last_status
+        self._report_status()
+
+    def _report_status(self) -> None:
+        """Publish a changed status; of many measurements and requests within PERIOD the last."""
+        report, (until, *shown) = self._report, self._last_status
         now = time.monotonic()
         self._status_pending = [report.level, report.reason is None] == shown and now < until
         if not self._status_pending:
-            self._publish_status(report, now)
-
-    def _publish_status(self, report: StepReport, now: float) -> None:
-        self._last_status = now + PERIOD, report.level, report.reason is None
-        self._status_pending = False
-        self._diagnostics.publish_if_changed()
+            self._last_status = now + PERIOD, report.level, report.reason is None
+            self._diagnostics.publish_if_changed()
 
     def _statuses(self) -> dict[str, TaskReport]:
         loop = self._loop

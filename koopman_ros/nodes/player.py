@@ -44,8 +44,8 @@ class PlayerNode(LoopNode):
     def __init__(self) -> None:
         super().__init__('player')
         self._settings = settings = self.declare_table(player_table(self.given()))
-        if reason := topics.unusable(
-                self, (*settings.topics, *settings.measurement, settings.answer)):
+        if reason := topics.unusable(self, list(filter(None, (
+                *settings.topics, *settings.measurement, settings.answer)))):
             raise ConfigurationError(reason)
         # by topic of the bag
         names = {'/' + name.lstrip('/'): name for name in settings.topics}

@@ -172,11 +172,15 @@ def rests_outside(controller: Controller) -> str:
     where = 'does not settle' if np.isnan(rest.x).any() else (
         f'would settle at about {model.states.text(rest.x)} by extrapolation')
     inputs = model.inputs.names, model.inputs.units
-    better = ', '.join(
-        f'{name}.safe_value = {quantity_text(held, unit)} or {"more" if held > now else "less"}'
-        for name, unit, now, held in zip(*inputs, safe.tolist(), holding.tolist(), strict=True))
+    # the input that holds a plant of several inputs there may be far out of their range
+    better = '' if controller.tuning.limits.within(holding).tolist() != holding.tolist() else (
+        ', or set ' + ', '.join(
+            f'{name}.safe_value = {quantity_text(held, unit)} or '
+            f'{"more" if held > now else "less"}' for name, unit, now, held in zip(
+                *inputs, safe.tolist(), holding.tolist(), strict=True))
+        + ' if that is still safe')
     under = ', '.join(f'{name}.safe_value = {quantity_text(now, unit)}' for name, unit, now in zip(
         *inputs, safe.tolist(), strict=True))
     return (f'under {under} the plant leaves the trained range, {ranges(model)}, and {where}: no '
-            'law can act there, and recovery is slow; record data there and train again, or set '
-            f'{better} if that is still safe')
+            'law can act there, and recovery is slow; record data there and train again'
+            f'{better}')

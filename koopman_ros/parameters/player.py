@@ -69,7 +69,12 @@ class PlayerParameters:
 def _check_player(values: PlayerParameters) -> str:
     if values.bag.endswith('.csv') and values.rate == 0.0:
         return 'rate = 0 plays in lock-step, which a .csv of set-points cannot: set rate above 0'
-    return rejection(values.topics) or rejection((*values.measurement, values.answer))
+    if values.rate == 0.0 and not all((*values.measurement, values.answer)):
+        return ('rate = 0 waits for the command that answers each measurement: set measurement '
+                'and answer to their topics, or rate above 0')
+    if values.clock and not all(values.measurement):
+        return 'clock publishes the stamps of measurements: set measurement to their topics'
+    return rejection(values.topics)
 
 
 def player_table(given: Mapping[str, Any] = MappingProxyType({})

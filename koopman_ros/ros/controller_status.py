@@ -334,8 +334,8 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
         **now.model(),
         **values_by_name(signals.states, now.measured.tolist()),
         **labelled(controlled, 'set-point', None if target is None else target.setpoint),
-        **values_by_name(signals.disturbances, [] if state.disturbances is None
-                         else state.disturbances.value.tolist()),
+        **values_by_name(signals.disturbances, [math.nan] * len(signals.disturbances)
+                         if state.disturbances is None else state.disturbances.value.tolist()),
         **values_by_name(inputs, [math.nan] * len(inputs) if state.command is None
                          else state.command.tolist()),
         **labelled(inputs, 'disturbance', None if estimate is None else estimate.disturbance,

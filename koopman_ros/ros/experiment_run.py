@@ -336,9 +336,7 @@ class ExperimentRun:
 
 def other_publishers(node: Node, topic: str, own: int = 0) -> str:
     """Return the nodes that publish on a topic, except `own` publishers of this node."""
-    # a publisher may be known before its node is
-    names = ['another node' if 'UNKNOWN' in info.node_name else topics.node_name(info)
-             for info in node.get_publishers_info_by_topic(topic)]
+    names = list(map(topics.node_name, node.get_publishers_info_by_topic(topic)))
     me = node.get_fully_qualified_name()
     # another node may have the same name
     others = {name for name in names if name != me}

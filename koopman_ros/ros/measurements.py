@@ -109,7 +109,7 @@ class Measurements:
     def _silent(self, now_ns: int) -> list[str]:
         """Return the signals whose heartbeat is over."""
         return [name for name, heartbeat_ns in self._heartbeats.items() if name not in
-                self._reported or now_ns - self._reported[name][0] > heartbeat_ns]
+                self._reported or abs(now_ns - self._reported[name][0]) > heartbeat_ns]
 
     @property
     def complaint(self) -> str:

@@ -241,7 +241,9 @@ def has_subscribers(publisher: Publisher) -> bool:
 
 def node_name(info: TopicEndpointInfo) -> str:
     """Return the name of the node that has an endpoint, with its namespace."""
-    return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+    # an endpoint may be known before its node is
+    return 'another node' if info.node_name == '_NODE_NAME_UNKNOWN_' else (
+        f'{info.node_namespace.rstrip("/")}/{info.node_name}')
 
 
 def type_name(kind: Any) -> str:

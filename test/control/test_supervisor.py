@@ -374,6 +374,10 @@ def test_a_lift_of_narrow_data_reports_a_safe_coolant_outside_its_range():
     assert ('record data there and train again, or set coolant_temperature.safe_value = 25.8'
             ) in words
     assert rests_outside(controller(narrow(), safe_value=np.array([holding + 0.1]))) == ''
+    # of a value that the controller may not command there is no advice
+    limits = replace(narrowed.tuning.limits, upper=np.array([holding - 1.0]))
+    assert rests_outside(replace(narrowed, tuning=replace(
+        narrowed.tuning, limits=limits))).endswith('record data there and train again')
     # and one that drives the reactor up
     hot = controller(safe_value=np.array([305.15]))
     assert hot.rest.holding[0] < 305.15

@@ -77,4 +77,7 @@ def test_an_input_that_was_not_held_between_samples_is_named() -> None:
     assert name == 'linear = u1'
     assert share > 0.9
     lines = [replace(one, linear=(True,)) for one in episodes]
+    # in some episodes it may have been measured
+    mixed = replace(found, fitted=(lines[0], *episodes[1:6]))
+    assert [name for _, name in likely_causes(mixed, 0)][:1] == ['linear = u1']
     assert not likely_causes(replace(found, fitted=tuple(lines[:6]), held_out=tuple(lines[6:])), 0)

@@ -278,10 +278,16 @@ def test_setpoints_of_a_csv_are_due_in_the_time_of_a_simulation(
 @pytest.mark.parametrize(('parameters', 'words'), [
     ({'bag': 'day.csv', 'rate': 0.0}, 'lock-step, which a .csv of set-points cannot'),
     ({'bag': 'day.csv'}, 'day.csv has no column temperature: name the columns time [s] and'),
-    ({'bag': 'day.csv', 'system': 'none', 'topics': ['setpoint'], 'measurement': ['temperature'],
-      'answer': 'coolant_setpoint'}, "system = 'none' has no set-points"),
+    ({'bag': 'day.csv', 'system': 'none', 'topics': ['setpoint']},
+     "system = 'none' has no set-points"),
     ({'bag': 'none.mcap'}, "cannot start: bag 'none.mcap' does not exist"),
     ({'topics': ['pressure']}, 'no message on /pressure: choose from /temperature'),
+    # of another plant, which needs no topics of measurements and commands in recorded time
+    ({'system': 'none', 'topics': ['temperature'], 'wait_timeout': 0.1},
+     '/temperature found no subscriber or publisher within 0.1 s'),
+    ({'system': 'none', 'topics': ['temperature'], 'rate': 0.0}, 'set measurement and answer'),
+    ({'system': 'none', 'topics': ['temperature'], 'clock': True}, 'set measurement'),
+    ({'system': 'none'}, "topics = ['']"),
     ({'rate': -1.0}, 'rate = -1.0 must be 0, or in [1e-06, 10000]'),
     ({'wait_timeout': 0.1}, '/temperature found no subscriber or publisher within 0.1 s'),
     ({'wait_for_subscribers': 0, 'rate': 0.0, 'answer_timeout': 0.1},

@@ -318,6 +318,18 @@ def test_a_loop_runs_on_its_own_clock_with_a_sensor_that_reports_on_change(
         DiagnosticStatus.ERROR, 'no measurement of temperature for more than 5 s'), 2.0)
     # it was received before the first /clock, and waited for by a clock of 0.5 s
     assert now >= 60.0 + 5.0 - 0.5
+    # a clock that is set back makes it no newer
+    now += 1000.0
+    thermometer.publish(temperature(STEADY, 5.0))
+    pass_until(lambda: told(DiagnosticStatus.OK, 'manual'))
+    pass_until(lambda: told(DiagnosticStatus.ERROR, 'no measurement of temperature'), 2.0)
+
+    def silence() -> float:
+        return float(value(ros.last_status(STATUS), 'since last measurement [s]'))
+
+    now, before = now - 900.0, silence()
+    pass_until(lambda: silence() > before + 1.5, 0.01)
+    assert now < 1000.0
 
 
 def test_a_signal_reported_on_change_is_in_each_measurement_and_a_late_one_in_the_estimate(

@@ -16,6 +16,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import SetBool
 
@@ -227,3 +228,10 @@ def test_another_end_that_does_not_match_is_reported_and_logged(
         pair.other.destroy_publisher(publisher)
     pair.wait(lambda: not pair.matching.complaint)
     assert f'[WARN] [own]: {complaint}\n' in re.sub(r' \[[0-9.]+\]', '', capfd.readouterr().err)
+
+
+def test_a_node_whose_name_has_not_arrived_is_another_node() -> None:
+    for name, namespace, text in (('hx', '/', '/hx'), ('hx', '/line', '/line/hx'), (
+            '_NODE_NAME_UNKNOWN_', '_NODE_NAMESPACE_UNKNOWN_', 'another node')):
+        assert topics.node_name(TopicEndpointInfo(
+            node_name=name, node_namespace=namespace)) == text

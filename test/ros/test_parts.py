@@ -172,8 +172,9 @@ def context(own: Controller, state: State, report: StepReport, silence: float = 
         reason='a reason', measured=own.model.states.center, setpoint_received=True,
         parameters=SimpleNamespace(
             max_measurement_age=5.0, measurement_timeout=0.0, tuning=own.tuning),
-        complaint='', unheard=(), unheard_for=0.0, request='', model_rejected='', input='coolant',
-        counts=Counts(measurements=measurements), model=dict, assembler=SimpleNamespace(
+        complaint='', awaited='', unheard=(), unheard_for=0.0, request='', model_rejected='',
+        input='coolant', counts=Counts(measurements=measurements), model=dict,
+        assembler=SimpleNamespace(
             awaited='', late={}, missing={}, duplicated={}),
         timing=SimpleNamespace(silence=silence, wall_silence=0.0, paused=False,
                                without_clock=False, age=math.nan, busy=False, answer_seconds=0.0,
@@ -208,6 +209,9 @@ def test_a_held_disturbance_is_a_warning_and_its_value_a_figure() -> None:
     heard = MeasuredInputs(signals.disturbances)
     assert MeasuredInputs(()).with_ages(0) == (None, None)
     state = State()
+    waiting = statuses(context(own, state, StepReport(
+        Mode.AUTOMATIC, own.order.levels[0]), measurements=0))
+    assert math.isnan(waiting['control'].values()['feed_temperature [degC]'])
     for k, (kelvin, words, expected) in enumerate((
             (None, 'no measurement of feed_temperature yet: its nominal value 76.85 degC', 76.85),
             (351.0, '', 77.85),
