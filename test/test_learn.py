@@ -117,6 +117,13 @@ def test_a_measured_disturbance_is_learned_and_keeps_its_role(folder, capsys):
     assert 'rain is 3 in the whole record: leave it out' in capsys.readouterr().err
 
 
+def test_inputs_that_moved_together_are_not_moved_apart_by_dead_times(folder, capsys):
+    rows = table(0, late=6)
+    rows.assign(**{'fan [V]': 2.0 * rows['pump [V]'] + 1.0}).to_csv('day.csv', index=False)
+    assert learned('--inputs', 'pump', 'fan') == 1
+    assert 'pump and fan moved together' in capsys.readouterr().err
+
+
 @pytest.mark.usefixtures('folder')
 def test_a_present_model_names_the_signals_and_has_to_be_beaten(day, capsys):
     assert learned('--model', str(day[0] / 'day.safetensors'), '--model_class', 'same',

@@ -192,12 +192,11 @@ def cells_of(values: Array, lower: Array | float, upper: Array | float) -> NDArr
 
 def visited_cells(episodes: Sequence[Episode], box: Box) -> NDArray[np.int64]:
     """Return the cells (K, n_x + n_u) of the box that measurements and their inputs lie in."""
-    found = []
-    for episode in episodes:
-        u = box.inputs.to_deviation(episode.inputs_at(episode.time))
-        xi = box.states.to_deviation(episode.interpolated())
-        found.append(cells_of(np.hstack([xi, u]), -1.0, 1.0))
-    return np.unique(np.concatenate(found), axis=0)
+    lower, upper = (np.append(getattr(box.states, end), getattr(box.inputs, end))
+                    for end in ('lower', 'upper'))
+    return np.unique(np.concatenate([
+        cells_of(np.hstack([one.interpolated(), one.inputs_at(one.time)]), lower, upper)
+        for one in episodes]), axis=0)
 
 
 def coverage(episodes: Sequence[Episode], box: Box) -> dict[tuple[str, str], float]:

@@ -28,6 +28,7 @@ from koopman_ros.learning.identification import (
     lagged,
     with_lag,
 )
+from koopman_ros.learning.identification.excitation import check_inputs
 from koopman_ros.learning.pipeline_progress import PipelineProgress
 from koopman_ros.learning.task import TrainingTask
 from koopman_ros.model import LONGEST_DEAD_TIME
@@ -55,6 +56,9 @@ def estimate_drift(task: TrainingTask, plant: PlantDescription, episodes: list[E
     :raises ValueError: for episodes that do not determine them, or a task that does not fit.
     """
     _check_disturbances(plant, episodes)
+    if not task.physical_model:
+        # before dead times move inputs apart that moved together
+        check_inputs(plant, episodes)
     seconds = SECONDS_PER_TIME_UNIT[plant.time_unit]
     lag = known = _given_lag(task, plant, episodes) / seconds
     dead_time = _dead_time(task, plant, _behind(episodes, lag), progress)

@@ -38,6 +38,7 @@ _LOST = 1e3  # error of a start that diverges, in half-ranges
 # The first samples of another day err by more than so many times the usual error. A steady state
 # that is a half-range elsewhere then counts as much as such an error of a sample.
 _OTHER_DAY = 1.5
+_FINEST = 50.0  # steps of a simulation in two samples
 _PICTURED = 3  # episodes of a picture
 
 
@@ -171,7 +172,7 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | 
     if init < 1:
         raise ValueError(f'init = {init} must be at least 1 sample')
     indexed = [replace(one, x=np.arange(1.0, 1 + len(one))[:, None]) for one in episodes]
-    step = longest_step(episodes)
+    step = _step(rate, states, episodes)
     inits = [max(1, min(init, len(one) // 2)) for one in episodes]
     if usual is None and offsets is None:
         usual = _usual(model, some.names)
@@ -203,6 +204,19 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | 
     if picture:
         free_run.draw(picture)
     return free_run
+
+
+def _step(rate: Rate, states: Coordinates, episodes: Sequence[Episode]) -> float:
+    """Return a step over which a Runge-Kutta method follows samples and the model's motion."""
+    middle, half = 0.5 * (states.upper + states.lower), 0.5 * (states.upper - states.lower)
+    u = np.repeat(episodes[0].u[:1], len(states), axis=0)
+    n = len(half)
+    points = middle + half * np.vstack([np.zeros(n), np.eye(n), -np.eye(n)])
+    fastest = max(float(np.max(np.abs(np.linalg.eigvals(differences(
+        lambda x: rate(x, u), point, states.scale))))) for point in points)
+    longest = longest_step(episodes)
+    # no slower than this, however stiff it is
+    return longest / min(max(1.0, fastest * longest), _FINEST)
 
 
 def _usual(model: AnyModel, names: Sequence[str]) -> Array | None:

@@ -12,6 +12,7 @@ import os
 from pathlib import Path
 import re
 from typing import Any, TypeAlias
+import warnings
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ Source: TypeAlias = Any
 
 _SIGNAL = re.compile(r'\s*(?:(\w+)\s*=\s*)?(\S.*?)\s*(?:\[([^\[\]]+)\])?\s*')
 _LOOK = 2 ** 16  # characters of a CSV file in which a decimal comma is looked for
+_DURATION = re.compile(r'(-?\d+ days?,? )?\+?\d+:\d\d:\d\d(\.\d*)?')
 _TIME_NAMES = ('time', 't', 'timestamp', 'datetime', 'date')
 # Numbers without a unit are seconds unless they cannot be: no record is 30 years long, and no
 # clock shows the year 5138. ROS and pandas count nanoseconds since 1970.
@@ -74,11 +76,13 @@ def table_of(source: Source) -> Any:
         return _columns(source)
     kind = Path(source).suffix.lower() if isinstance(source, str | os.PathLike) else ''
     if kind == '.csv':
-        with Path(source).open(encoding='utf-8-sig') as file:
-            head, rows = file.readline(), file.read(_LOOK)
-        separator = max(',;\t', key=head.count)
-        return pd.read_csv(source, sep=separator, skipinitialspace=True, encoding='utf-8-sig',
-                           decimal=',' if separator == ';' and ',' in rows else '.')
+        try:
+            return _csv_table(source)
+        except (ValueError, pd.errors.ParserWarning) as error:
+            raise ValueError(
+                f'{source} cannot be read ({str(error).strip()}): save it in UTF-8, with one row '
+                'of headers and as many cells in each row, or read it as a DataFrame, e.g. by '
+                "pandas.read_csv(file, encoding='latin-1')") from error
     if kind == '.parquet':
         try:
             return pd.read_parquet(source)
@@ -95,6 +99,21 @@ def table_of(source: Source) -> Any:
     what = f'a {type(source).__name__}' if not isinstance(source, str | os.PathLike) else source
     raise ValueError(f'{what} is not a record: give a .csv, .parquet, .mat or .mcap file, the '
                      'folder of a bag, a DataFrame of pandas, or columns by name')
+
+
+def _csv_table(source: Source) -> Any:
+    import pandas as pd
+    with Path(source).open(encoding='utf-8-sig') as file:
+        head, rows = file.readline(), file.read(_LOOK)
+    separator = max(',;\t', key=head.count)
+    decimal = ',' if separator != ',' and ',' in rows else '.'
+    with warnings.catch_warnings():
+        # without index_col pandas moves the headers where rows have more cells
+        warnings.simplefilter('error', pd.errors.ParserWarning)
+        table = pd.read_csv(source, sep=separator, decimal=decimal, skipinitialspace=True,
+                            encoding='utf-8-sig', index_col=False)
+    # texts remain in a column whose first cell is its unit
+    return table.replace(',', '.', regex=True) if decimal == ',' else table
 
 
 def _columns(arrays: Mapping[str, Any]) -> Any:
@@ -151,17 +170,31 @@ def seconds_of(table: Any, name: str, period: float) -> Array:
     if not (kinds.is_datetime64_any_dtype(column) or kinds.is_timedelta64_dtype(column)):
         numbers = pd.to_numeric(column, errors='coerce')
         if 2 * numbers.notna().sum() > len(column):
-            return _numbers_in_seconds(numbers.to_numpy(), unit, label)
-        # whole seconds may be written without a fraction, others with one
-        dates = pd.to_datetime(column, format='ISO8601', errors='coerce')
-        try:
-            column = pd.to_datetime(column) if (dates.isna() & column.notna()).any() else dates
-        except (TypeError, ValueError) as error:
-            raise ValueError(f'the column {label!r} holds neither numbers nor dates: name that of '
-                             'the times') from error
+            whole = kinds.is_integer_dtype(numbers) and numbers.notna().all()
+            return _numbers_in_seconds(
+                numbers.to_numpy(np.int64 if whole else np.float64), unit, label)
+        column = _dates(column)
     if not kinds.is_timedelta64_dtype(column):
         column = column - column.dropna().iloc[0]
     return column.dt.total_seconds().to_numpy(dtype=np.float64)
+
+
+def _dates(column: Any) -> Any:
+    """Return texts as dates or durations; where most rows have one, the others have none."""
+    import pandas as pd
+    first = str(column.dropna().iloc[0])
+    # whole seconds may be written without a fraction, and offsets differ with daylight-saving time
+    found = (pd.to_timedelta(column, errors='coerce') if _DURATION.fullmatch(first) else
+             pd.to_datetime(column, format='ISO8601', errors='coerce', utc=True))
+    if 2 * found.notna().sum() > len(column):
+        return found
+    try:
+        return pd.to_datetime(column, dayfirst='.' in first[:3], utc=True)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f'the column {str(column.name)!r} holds neither numbers nor dates of one form, but '
+            f'e.g. {first!r}: write dates as 2026-01-31 14:00:00, or name another column'
+        ) from error
 
 
 def _time_column(table: Any, name: str) -> tuple[Any, str]:
@@ -171,8 +204,8 @@ def _time_column(table: Any, name: str) -> tuple[Any, str]:
     if not name and isinstance(table.index, pd.DatetimeIndex | pd.TimedeltaIndex):
         return index, ''
     wanted = SignalColumn.of(name or next(
-        (one for one in map(str, table.columns)
-         if re.split(r'[\s\[]', one.strip().lower())[0] in _TIME_NAMES), 'time'))
+        (one for known in _TIME_NAMES for one in map(str, table.columns)
+         if re.split(r'[\s\[]', one.strip().lower())[0] == known), 'time'))
     if (found := header_of(table, wanted.column)) is not None:
         return table[found[0]], wanted.unit or found[1]
     if name and wanted.column == table.index.name:
@@ -235,7 +268,9 @@ class TableImport:
         values = np.where(np.isfinite(values), values, np.nan)
         missing = int(np.sum(np.isnan(values)))
         if missing == len(values):
-            raise ValueError(f'the column {str(header)!r} holds no number: name another one')
+            texts = [f', but e.g. {str(one)!r}' for one in table[header].dropna()[:1]]
+            raise ValueError(f'the column {str(header)!r} holds no number{"".join(texts)}: write '
+                             'numbers as 1.5, or name another column')
         if missing and signal in self.states:
             self.report.note(f'{self.label}: {signal.name} was measured in '
                              f'{len(values) - missing} of {len(values)} rows')

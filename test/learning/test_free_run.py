@@ -64,6 +64,17 @@ def test_a_right_model_follows_the_record(model, states):
     assert run.paths[0].shape == (N, 2)
 
 
+def test_a_model_that_is_faster_than_the_samples_is_followed():
+    fast = np.array([[0.0, 1.0], [-25.0, -2.0]])
+    step, gain = sampled(fast, B, 1.0)
+    u, path = np.random.default_rng(3).uniform(-1.0, 1.0, N), [np.zeros(2)]
+    for value in u[:-1]:
+        path.append(step @ path[-1] + gain[:, 0] * value)
+    record = read({'time': np.arange(N), 'force': u, 'position': np.array(path)[:, 0]},
+                  'position [m]', 'force [N]')
+    assert simulate(lifted(slope=fast), record).fit[0] > 97.0
+
+
 def test_units_of_the_record_are_converted():
     values = table()
     run = simulate(lifted(), read({**values, 'position': 1e3 * values['position']},

@@ -299,11 +299,13 @@ BOX = box([0.0], [10.0], [100.0], [200.0])
      [[0, 0], [5, 5], [9, 9]]),
     # outside counts for the border
     ([-3.0, 40.0], [90.0, 150.0], [[0, 0], [9, 5]])])
-def test_visited_cells_and_their_share_of_all(x, u, cells):
+@pytest.mark.parametrize('nominal', [5.0, 2.0])
+def test_visited_cells_and_their_share_of_all(x, u, cells, nominal):
     times = np.arange(float(len(x)))
     episodes = [Episode(times, np.array(x)[:, None], times, np.array(u)[:, None])]
-    assert visited_cells(episodes, BOX).tolist() == cells
-    assert coverage(episodes, BOX) == {('x1', 'u1'): pytest.approx(len(cells) / 100.0)}
+    within = replace(BOX, states=replace(BOX.states, center=np.array([nominal])))
+    assert visited_cells(episodes, within).tolist() == cells
+    assert coverage(episodes, within) == {('x1', 'u1'): pytest.approx(len(cells) / 100.0)}
 
 
 def test_cells_of_two_states_under_an_input_that_is_held():

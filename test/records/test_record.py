@@ -18,6 +18,8 @@ SECONDS = PERIOD * np.arange(N)
 LEVEL = 1.0 + 0.5 * np.sin(0.3 * SECONDS)
 PUMP = np.repeat([2.0, 4.0, 3.0], N // 3)
 START = pd.Timestamp('2026-03-01 08:00:00')
+LATE = pd.Timestamp('2026-02-12 23:59:45')
+DST = pd.Timestamp('2026-03-29 01:59:45', tz='Europe/Berlin')
 RECORDS = Path(__file__).parents[2] / '../shared/records'
 
 
@@ -68,11 +70,21 @@ def test_each_kind_of_file_gives_the_same_episode(tmp_path, write):
     ('stamp', (START.tz_localize('Europe/Berlin') + pd.to_timedelta(SECONDS, 's'))),
     ('stamp', [str(START + pd.Timedelta(t, 's')) for t in SECONDS]),
     ('stamp', [(START + pd.Timedelta(t, 's')).strftime('%m/%d/%Y %H:%M:%S.%f') for t in SECONDS]),
+    # over the change to daylight-saving time, and to a day that is no month
+    ('stamp', [(DST + pd.Timedelta(t, 's')).isoformat() for t in SECONDS]),
+    ('stamp', [(LATE + pd.Timedelta(t, 's')).strftime('%d.%m.%Y %H:%M:%S.%f') for t in SECONDS]),
     ('elapsed', pd.to_timedelta(SECONDS, 's')),
+    ('elapsed', [str(pd.Timedelta(t, 's')) for t in SECONDS]),
+    ('time [ms]', (1000 * SECONDS).astype(np.uint64)[::-1]),
 ])
 def test_times_of_each_kind_are_seconds_since_the_first_measurement(column, times):
     name = '' if column.lower()[0] == 't' else column
     assert levels(frame(**{column: times}), time=name).time == pytest.approx(SECONDS)
+
+
+def test_rows_of_another_kind_have_no_time():
+    stamps = ['YYYY-MM-DD', *map(str, START + pd.to_timedelta(SECONDS[1:], 's'))]
+    assert levels(frame(date=['2026-03-01'] * N, time=stamps)).time == pytest.approx(SECONDS[:-1])
 
 
 @pytest.mark.parametrize('options', [{'period': PERIOD}, {'time': 'when [min]'}, {}])
@@ -102,15 +114,36 @@ def test_rejects_times_and_columns_that_are_none(columns, options, words):
         read(frame(**columns), 'level', 'pump', **options)
 
 
-@pytest.mark.parametrize(('second', 'point'), [('s;m;V', '.'), ('0;1;2', ',')])
+@pytest.mark.parametrize(('second', 'point', 'separator'), [
+    ('s;m;V', '.', ';'), ('0;1;2', ',', ';'), ('s;m;V', ',', ';'), ('0;1;2', ',', '\t')])
 def test_a_row_of_units_below_the_header_and_late_decimal_commas_are_understood(
-        tmp_path, second, point):
+        tmp_path, second, point, separator):
     rows = [f'{t:g};{x:g};{u:g}'.replace('.', point) for t, x, u in zip(
-        SECONDS, LEVEL, PUMP, strict=True)][point == ',':]
-    (tmp_path / 'day.csv').write_text('\n'.join(['time;level;pump', second, *rows]))
+        SECONDS, LEVEL, PUMP, strict=True)][second[0] == '0':]
+    text = '\n'.join(['time;level;pump', second, *rows])
+    (tmp_path / 'day.csv').write_text(text.replace(';', separator))
     record = read(tmp_path / 'day.csv', 'level [m]', 'pump [V]')
     assert record.episodes[0].time == pytest.approx(SECONDS)
     assert record.episodes[0].x[:, 0] == pytest.approx(LEVEL, rel=1e-5)
+
+
+@pytest.mark.parametrize(('text', 'words'), [
+    ('time;level [°C];pump\n0;1;2\n', 'day.csv .*UTF-8'),
+    ('time,level,pump\n' + '0,1,5,2,5\n' * N, 'as many cells'),
+    ('# logger\ntime,level,pump\n0,1,2\n', 'one row of headers'),
+    ('', 'one row of headers'),
+    ('time,level,pump\n' + '1,"0,5",2\n' * N, "but e.g. '0,5': write numbers as 1.5"),
+])
+def test_a_file_that_is_no_table_is_named_with_the_next_step(tmp_path, text, words):
+    (tmp_path / 'day.csv').write_text(text, encoding='latin-1')
+    with pytest.raises(ValueError, match=words):
+        read(tmp_path / 'day.csv', 'level', 'pump')
+
+
+def test_a_separator_at_the_end_of_each_row_moves_no_column(tmp_path):
+    rows = [f'{t},{x},{u},' for t, x, u in zip(SECONDS, LEVEL, PUMP, strict=True)]
+    (tmp_path / 'day.csv').write_text('\n'.join(['time,level,pump', *rows]))
+    assert levels(tmp_path / 'day.csv').x[:, 0].tolist() == LEVEL.tolist()
 
 
 def test_a_signal_may_have_another_column_name_and_unit():
