@@ -9,6 +9,7 @@ import json
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 
 from koopman_ros.core.units import display_unit, to_kelvin
@@ -328,6 +329,20 @@ def test_a_silence_has_its_node_and_time() -> None:
     assert (silence.since, silence.seen) == (NOW + 19.0, True)
 
 
+def test_a_clock_that_is_set_back_hides_no_silence_and_feigns_none() -> None:
+    own = view()
+    for second in (1.0, 2.0):
+        measure(own, 50.0, second)
+        status(own, CONTROL, OK, 'automatic', {}, NOW + second)
+    back = NOW - 3600.0
+    measure(own, 50.0, 3.0, back + 3.0)
+    own.advance(back + 3.2)
+    assert own.snapshot(back + 3.2).silences == ()
+    own.advance(back + 10.0)
+    assert {(one.role, one.since) for one in own.snapshot(back + 10.0).silences} == {
+        (PLANT, back + 3.0), (CONTROLLER, back + 3.0)}
+
+
 def test_a_slow_plant_is_not_silent_between_its_measurements() -> None:
     own = view()
     for minute in range(1, 5):
@@ -556,6 +571,15 @@ def test_pens_and_marks_are_in_the_time_of_the_plant() -> None:
     assert found['temperature set-point'][1].tolist() == pytest.approx([45.0] * 3)
     assert [(mark.time, mark.text) for mark in own.trends.marks(0.0, 10.0)] == [
         (3.0, 'manual mode')]
+
+
+def test_no_line_is_drawn_across_a_silence_of_the_plant() -> None:
+    own = view()
+    for second in (1.0, 2.0, 100.0, 101.0):
+        measure(own, 50.0 + second, second)
+    times, values = own.trends.window(['temperature'], 0.0, 200.0)['temperature']
+    assert times.tolist() == pytest.approx([1.0, 2.0, 2.0, 100.0, 101.0])
+    assert np.isnan(values).tolist() == [False, False, True, False, False]
 
 
 def test_time_that_begins_again_begins_the_trends_again() -> None:
