@@ -21,7 +21,7 @@ def readable(name: str) -> str:
 
 def number(value: float, decimals: int) -> str:
     """Write a number, or a dash for none."""
-    return f'{value:.{decimals}f}' if math.isfinite(value) else '–'
+    return f'{value:z.{decimals}f}' if math.isfinite(value) else '–'
 
 
 def span_text(bounds: Range, decimals: int) -> str:

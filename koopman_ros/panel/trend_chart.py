@@ -290,7 +290,9 @@ def _options(charts: _Charts, height: int, zoom: bool) -> dict[str, Any]:
                     'textStyle': {'color': '#1d1d1b', 'fontSize': 13}, 'icon': 'roundRect',
                     'itemHeight': 14, 'itemWidth': 14}
                    for _, own_pens in charts],
-        'grid': [{'left': 56, 'right': 16, 'height': height - _HEAD - _FOOT} for _ in charts],
+        # all charts have the same width, also below a long name
+        'grid': [{'left': 56, 'right': 16, 'height': height - _HEAD - _FOOT,
+                  'outerBoundsContain': 'axisLabel'} for _ in charts],
         'xAxis': [{'type': 'time', 'gridIndex': at, 'nameLocation': 'middle', 'nameGap': 22,
                    'nameTextStyle': {'color': '#4d4d4a'},
                    'axisPointer': {'label': {':formatter': f'p => ({_CLOCK})(p.value)'}},

@@ -364,6 +364,7 @@ def test_an_alarm_is_raised_shelved_shown_again_acknowledged_and_gone(site: Site
             expect(own).to_contain_text('MEDIUM')
             fits(page)
             expect(page.get_by_role('link', name=re.compile(r'Alarms \(\d\)'))).to_be_visible()
+            expect(own.get_by_role('button', name='Shelve 8 h')).to_be_visible()
             own.get_by_role('button', name='Shelve 10 min').click()
             expect(own).to_have_count(0)
             shelved = page.get_by_label('Shelved alarms')
@@ -478,6 +479,8 @@ def test_a_controller_that_is_gone_has_a_banner_until_it_is_back(site: Site) -> 
                            ('/', 'Controller')):
             page.goto(f'{site.url}{path}')
             expect(card(page, name)).to_have_attribute('inert', '')
+            expect(card(page, name).get_by_role('button', name='Export YAML', disabled=False)
+                   ).to_have_count(0)
         site.controller = site.ros.start('controller')
         expect(banner).to_be_hidden()
         expect(page.locator('header')).to_contain_text('AUTOMATIC')

@@ -456,6 +456,29 @@ def test_an_hour_is_drawn_with_its_extremes_and_finely_where_it_is_zoomed(
         browser.forgive()
 
 
+WIDTHS = """() => {
+    const chart = document.querySelector('.nicegui-echart');
+    const grids = getElement(parseInt(chart.id.slice(1))).chart.getModel().queryComponents(
+        {mainType: 'grid'});
+    return grids.map(grid => grid.coordinateSystem.getRect().width);
+}"""
+
+
+def test_long_names_and_numbers_fit_a_narrow_window(
+        site: Site, browser: Pages, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = site.source.snapshot
+    monkeypatch.setattr(site.source, 'snapshot', replace(now, states=tuple(
+        replace(face, measured=-1.23e18) for face in now.states)))
+    with browser.page('about:blank') as page:
+        page.set_viewport_size({'width': 375, 'height': 800})
+        log_in(page, site)
+        expect(page.locator('.big').first).to_contain_text('-1230000000000000000')
+        assert page.evaluate('document.querySelector(".page").scrollWidth') <= 375
+        until(lambda: len(page.evaluate(WIDTHS)) == 3)
+        assert len(set(page.evaluate(WIDTHS))) == 1
+        browser.forgive()
+
+
 LAST_TIME = """() => {
     const chart = document.querySelector('.nicegui-echart');
     const axis = getElement(parseInt(chart.id.slice(1))).chart.getOption().xAxis[0];

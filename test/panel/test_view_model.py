@@ -220,7 +220,7 @@ def test_bars_hold_ranges_and_values() -> None:
     assert state.span == pytest.approx((29.8, 56.2))
     assert state.share(43.0) == pytest.approx(0.5)
     assert [state.share(value) for value in (0.0, 99.0, math.nan)] == [0.0, 1.0, 0.0]
-    assert (state.decimals, state.text(43.0)) == (1, '43.0')
+    assert (state.decimals, state.text(43.0), state.text(-0.01)) == (1, '43.0', '0.0')
     assert given.limits == (5.0, 32.0)
     assert given.abnormal == 'at its upper limit'
     # a value that left the range is on the bar, and said to be out
