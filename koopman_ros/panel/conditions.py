@@ -27,6 +27,7 @@ from koopman_ros.panel.snapshot import (
 
 _SILENT = 3.5  # s without a status, of which there is one per second
 _START = 30.0  # s for which the nodes of a loop may start one after the other
+_GONE = 10.0  # s without a status until a simulated plant counts as gone
 _ENDED = 10.0  # s for which an experiment or training that failed is an active alarm
 _PERIODS = 5.0  # usual times between two measurements without one
 _MAX_TASKS = 64  # statuses of the loop that are kept, and of other nodes
@@ -53,6 +54,7 @@ class Conditions:
         self._errors: dict[str, deque[tuple[float, str]]] = {}
         self._keys: dict[str, tuple[str, ...]] = {}  # of the alarms of each task
         self._since: dict[str, float] = {}  # wall time of the present message, by task
+        self._simulated = now  # wall time of the last status of a simulated plant
         self._begun: dict[str, float] = {}  # wall time of the first message, by role
         self._last: dict[str, float] = {}  # wall time of the last message, by role
         self._period = 0.0  # of the measurements
@@ -98,6 +100,8 @@ class Conditions:
                 self._watched.append(role)
         if role in (PLANT, CONTROLLER):
             self.plant = plant or self.plant
+        if role == PLANT:
+            self._simulated = now
         before = self.statuses.get(name)
         status = self.statuses[name] = TaskStatus(
             name, level, message or ('' if level == OK else 'no reason was given'), dict(values))
@@ -151,6 +155,12 @@ class Conditions:
     def advance(self, now: float) -> None:
         """Raise the alarms of silence and of repeated errors, and let delays run out."""
         self._follow_clock(now)
+        if now - self._simulated > _GONE:
+            # perhaps a driver without statuses has replaced it
+            for name in [task for task in self.statuses if task.startswith(f'{PLANT}: ')]:
+                status = self.statuses.pop(name)
+                for key in self._keys.pop(name):
+                    self.alarms.report(key, False, Priority.LOW, status.message, now)
         for name, errors in self._errors.items():
             often = len(errors) == _REPEATED and now - errors[0][0] <= _WITHIN
             self.alarms.report(
@@ -173,6 +183,7 @@ class Conditions:
         self._now = now
         if back:
             self._start -= back
+            self._simulated -= back
             for times in (self._since, self._begun, self._last):
                 times.update({key: time - back for key, time in times.items()})
             for name, errors in self._errors.items():

@@ -377,6 +377,21 @@ def test_silence_and_levels_are_alarms_by_priority_and_marks() -> None:
     assert own.snapshot(NOW + 20.0).mode == ''
 
 
+def test_a_simulated_plant_that_is_replaced_leaves_no_alarm() -> None:
+    own = view()
+    for second in range(1, 40):
+        if second < 20:
+            status(own, 'plant: simulation', ERROR, 'stopped', {}, NOW + second)
+        measure(own, 50.0, float(second))
+        status(own, CONTROL, OK, 'automatic', {}, NOW + second)
+        own.advance(NOW + second)
+        now = own.snapshot(NOW + second)
+        if second == 19:
+            assert [alarm.state for alarm in now.standing] == [AlarmState.UNACKNOWLEDGED]
+    assert [alarm.state for alarm in now.standing] == [AlarmState.RETURNED]
+    assert list(now.statuses) == [CONTROL]
+
+
 def test_nodes_of_another_loop_are_ignored() -> None:
     read = {name: display_unit(unit) for name, unit in REACTOR.units.items()}
     own = LoopViewModel(REACTOR, read, 3600.0, NOW, {
