@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 import json
 import math
+import sys
 from typing import Any
 
 import numpy as np
@@ -228,6 +229,19 @@ def test_bars_hold_ranges_and_values() -> None:
     (state,) = own.snapshot(NOW + 2.0).states
     assert state.span[1] == pytest.approx(80.0)
     assert state.abnormal == 'above the trained range'
+
+
+@pytest.mark.parametrize(('value', 'text'), [
+    (sys.float_info.max, '1.79769e+308'), (-sys.float_info.max, '-1.79769e+308'),
+    (5e-324, '0.00'), (math.inf, '–')])
+def test_any_number_is_shown(value: float, text: str) -> None:
+    own = view(TANKS)
+    for setpoint in (value, 1.0, -value):
+        own.take_signals('active_setpoints', {'level_1': setpoint}, 1.0, NOW)
+        own.take_signals('measured', {'level_1': value}, 1.0, NOW)
+        state = own.snapshot(NOW).states[0]
+        assert state.text(state.measured) == text
+        assert 0.0 <= state.share(state.measured) <= 1.0
 
 
 @pytest.mark.parametrize(('bounds', 'text'), [
