@@ -321,6 +321,12 @@ class PanelNode(LoopNode):
         if not self.count_publishers(topics.EVENT_LOG):
             reply(_not_running(CONTROLLER))
             return
+        low, high = map(conversion(place.unit, read), place.range)
+        if not low <= value <= high:
+            # the controller would read it as no number
+            reply(Answer(False, f'outside {low:.6g} to {high:.6g} {read}, the range of the '
+                                f'messages on {place.topic}'))
+            return
         accepted = 'accepted'
         if setpoint and self.snapshot.mode == 'manual':
             accepted = 'accepted: the controller follows it only in automatic mode'

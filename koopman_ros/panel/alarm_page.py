@@ -94,8 +94,9 @@ def alarm_rows(page: PageLayout, name: str, *, shelving: bool = False, none: str
         button = page.button('Acknowledge', lambda: _act(page, 'acknowledge', first.key)).props(
             'dense')
         for text, seconds in _SHELVING.items() if shelving else ():
-            page.control(ui.button(text, on_click=lambda _, s=seconds: _act(
-                page, 'shelve', first.key, s)).props('flat dense'))
+            attribute(page.control(ui.button(text, on_click=lambda _, s=seconds: _act(
+                page, 'shelve', first.key, s)).props('flat dense')),
+                'aria-label', f'Shelve {text.removeprefix("Shelve ")}')
 
         def update(alarm: Alarm) -> None:
             word = alarm.priority.word

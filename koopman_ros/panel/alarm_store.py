@@ -69,7 +69,8 @@ class AlarmStore:
 
     def save(self, now: float) -> None:
         """Save changes, every few seconds; to be called more often."""
-        if now >= self._due and self._alarms.noted != self._saved:
+        # a clock that was set back does not delay it
+        if self._alarms.noted != self._saved and not self._due - _INTERVAL <= now < self._due:
             self._due = now + _INTERVAL
             self._save()
 

@@ -27,6 +27,7 @@ from koopman_ros.panel.snapshot import (
 
 _SILENT = 3.5  # s without a status, of which there is one per second
 _START = 30.0  # s for which the nodes of a loop may start one after the other
+_GONE = 10.0  # s without a status until a simulated plant counts as gone
 _ENDED = 10.0  # s for which an experiment or training that failed is an active alarm
 _PERIODS = 5.0  # usual times between two measurements without one
 _MAX_TASKS = 64  # statuses of the loop that are kept, and of other nodes
@@ -41,18 +42,19 @@ class Conditions:
     Last statuses and messages of a loop, and their alarms.
 
     :param nodes: roles of the loop's nodes by their full names without the first slash.
-    :param now: wall time, as in all methods.
+    :param now: wall time, as in all methods; if it jumps back, all ages stay as they are.
     """
 
     def __init__(self, nodes: Mapping[str, str], now: float) -> None:
         self.alarms = Alarms()
         self.plant = ''  #: name of the plant
         self.statuses: dict[str, TaskStatus] = {}
-        self._nodes, self._start = dict(nodes), now
+        self._nodes, self._start, self._now = dict(nodes), now, now
         # wall time and message of the last changes to ERROR, by task
         self._errors: dict[str, deque[tuple[float, str]]] = {}
         self._keys: dict[str, tuple[str, ...]] = {}  # of the alarms of each task
         self._since: dict[str, float] = {}  # wall time of the present message, by task
+        self._simulated = now  # wall time of the last status of a simulated plant
         self._begun: dict[str, float] = {}  # wall time of the first message, by role
         self._last: dict[str, float] = {}  # wall time of the last message, by role
         self._period = 0.0  # of the measurements
@@ -60,6 +62,7 @@ class Conditions:
 
     def take_message(self, role: str, now: float) -> None:
         """Take note of a message of a node; of the plant it is a measurement."""
+        self._follow_clock(now)
         last = self._last.get(role)
         if last is None or now - last > self._patience(role):
             self._begun[role] = now
@@ -83,6 +86,7 @@ class Conditions:
     def take_status(self, name: str, level: int, message: str, values: Mapping[str, str],
                     now: float, plant: str = '') -> None:
         """Take the status of a task; WARN and ERROR raise an alarm."""
+        self._follow_clock(now)
         role = self._nodes.get(name.partition(': ')[0])
         name = sanitize_text(self.task(name), _MAX_NAME)
         # other nodes cannot crowd out the loop's
@@ -96,6 +100,8 @@ class Conditions:
                 self._watched.append(role)
         if role in (PLANT, CONTROLLER):
             self.plant = plant or self.plant
+        if role == PLANT:
+            self._simulated = now
         before = self.statuses.get(name)
         status = self.statuses[name] = TaskStatus(
             name, level, message or ('' if level == OK else 'no reason was given'), dict(values))
@@ -130,11 +136,11 @@ class Conditions:
             # the controller has noticed it as well
             return False
         if status.name == MEASUREMENTS:
-            return not self._is_silent(PLANT, now)
+            return not self.is_silent(PLANT, now)
         if status.name != CONTROL:
             return True
         if self._unmeasured():
-            return now - self._begun[CONTROLLER] > _START and not self._is_silent(PLANT, now)
+            return now - self._begun[CONTROLLER] > _START and not self.is_silent(PLANT, now)
         return status.level >= ERROR or status.values.get('condition', 'control') == 'control'
 
     def _unmeasured(self) -> bool:
@@ -148,6 +154,13 @@ class Conditions:
 
     def advance(self, now: float) -> None:
         """Raise the alarms of silence and of repeated errors, and let delays run out."""
+        self._follow_clock(now)
+        if now - self._simulated > _GONE:
+            # perhaps a driver without statuses has replaced it
+            for name in [task for task in self.statuses if task.startswith(f'{PLANT}: ')]:
+                status = self.statuses.pop(name)
+                for key in self._keys.pop(name):
+                    self.alarms.report(key, False, Priority.LOW, status.message, now)
         for name, errors in self._errors.items():
             often = len(errors) == _REPEATED and now - errors[0][0] <= _WITHIN
             self.alarms.report(
@@ -157,20 +170,33 @@ class Conditions:
             text = f'no message from the {role}'
             if role == PLANT:
                 # the message of the controller says how it reacts
-                reported = self._unmeasured() and not self._is_silent(CONTROLLER, now)
+                reported = self._unmeasured() and not self.is_silent(CONTROLLER, now)
                 text = self.statuses[CONTROL].message if reported else 'no measurement'
-            silent = self._is_silent(role, now) and (
+            silent = self.is_silent(role, now) and (
                 role in self._last or now - self._start > _START)
             self.alarms.report(f'silence of {role}', silent,
                                Priority.LOW if role == TRAINER else Priority.HIGH, text, now)
         self.alarms.advance(now)
 
+    def _follow_clock(self, now: float) -> None:
+        back = max(self._now - now, 0.0)
+        self._now = now
+        if back:
+            self._start -= back
+            self._simulated -= back
+            for times in (self._since, self._begun, self._last):
+                times.update({key: time - back for key, time in times.items()})
+            for name, errors in self._errors.items():
+                self._errors[name] = deque(
+                    [(time - back, text) for time, text in errors], _REPEATED)
+
     def silences(self, now: float) -> tuple[SilentTopic, ...]:
         """Return the silent nodes."""
         return tuple(SilentTopic(role, self._last.get(role, self._start), role in self._last)
-                     for role in self._watched if self._is_silent(role, now))
+                     for role in self._watched if self.is_silent(role, now))
 
-    def _is_silent(self, role: str, now: float) -> bool:
+    def is_silent(self, role: str, now: float) -> bool:
+        """Return whether a node has sent no message for too long."""
         return now - self._last.get(role, self._start) > self._patience(role)
 
     def _patience(self, role: str) -> float:

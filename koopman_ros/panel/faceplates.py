@@ -12,6 +12,8 @@ import math
 from koopman_ros.core.units import conversion, printed
 
 Range = tuple[float, float]
+_LARGEST = 1e300  # on a bar: a broken sensor may send the largest number that there is
+_EXACT = 1e15  # from here on not all digits of a number are known
 
 
 def readable(name: str) -> str:
@@ -21,7 +23,9 @@ def readable(name: str) -> str:
 
 def number(value: float, decimals: int) -> str:
     """Write a number, or a dash for none."""
-    return f'{value:.{decimals}f}' if math.isfinite(value) else '–'
+    if not math.isfinite(value):
+        return '–'
+    return f'{value:z.{decimals}f}' if abs(value) < _EXACT else f'{value:.6g}'
 
 
 def span_text(bounds: Range, decimals: int) -> str:
@@ -153,8 +157,8 @@ class SignalValues:
 
 def _span(ranges: Sequence[Range | None], values: Sequence[float]) -> Range:
     """Return the range of a bar: the first finite one, a little wider, with all values in it."""
-    known = next((one for one in ranges if one and math.isfinite(one[1] - one[0])), None)
-    finite = [value for value in values if math.isfinite(value)]
+    known = next((one for one in ranges if one and math.hypot(*one) < _LARGEST), None)
+    finite = [min(max(value, -_LARGEST), _LARGEST) for value in values if math.isfinite(value)]
     low, high = known or (min(finite, default=0.0), max(finite, default=1.0))
     margin = 0.1 * (high - low) or max(1.0, 0.1 * abs(high))
     # a range of positive numbers begins at zero at most

@@ -109,7 +109,8 @@ class PageLayout:
                                  for alarm in now.standing)
             tabs['/alarms'].set_text(
                 f'Alarms ({unacknowledged})' if unacknowledged else 'Alarms')
-            if now.wall - self._beat_at >= 1.0:
+            # also where the clock was set back
+            if abs(now.wall - self._beat_at) >= 1.0:
                 self._beat_at = now.wall
                 beat.set_text(f'wall time {clock(now.wall)}')
                 attribute(beat, 'data-beat', f'{now.wall:.1f}')

@@ -137,8 +137,10 @@ def _model(page: PageLayout) -> None:
                 await page.act('parameters', CONTROLLER, {_FORCE: False}, {_FORCE: True})
 
         def trained() -> tuple[str, bool]:
-            values = page.source.snapshot.status(TRAINING).values
-            return values.get('model_file', ''), values.get('accepted') == 'False'
+            status = page.source.snapshot.status(TRAINING)
+            # a training replaces the file when it ends
+            return ('', False) if training_running(status) else (
+                page.source.learning.new_model(status.values))
 
         with box('row1'):
             new = page.button('', lambda: activate(*trained()))
@@ -263,6 +265,18 @@ def experiment_limits(parameters: Mapping[str, ParameterDescription]) -> list[st
     return lines
 
 
+def training_running(status: TaskStatus) -> bool:
+    """Return whether a training can be cancelled."""
+    return _done(status) < 100.0 and status.level == OK and 'accepted' not in status.values
+
+
+def _done(status: TaskStatus) -> float:
+    try:
+        return float(status.values.get(_DONE, 'nan'))
+    except ValueError:
+        return math.nan
+
+
 def _training(page: PageLayout) -> None:
     with page.card('training', 'Training', TRAINER):
         progress = ui.linear_progress(0.0, show_value=False, size='14px').props(
@@ -274,11 +288,7 @@ def _training(page: PageLayout) -> None:
 
     def show(now: Snapshot) -> None:
         found = now.status(TRAINING)
-        try:
-            done = float(found.values.get(_DONE, 'nan'))
-        except ValueError:
-            done = math.nan
-        running = done < 100.0 and found.level == OK and 'accepted' not in found.values
+        done, running = _done(found), training_running(found)
         page.allow(train, not running, 'a training is running')
         page.allow(cancel, running, 'no training is running')
         progress.set_value(0.0 if math.isnan(done) else round(done) / 100.0)

@@ -215,9 +215,8 @@ def _input_card(page: PageLayout, at: int, face: InputFaceplate) -> None:
         applied.set_text(f'{own.text(own.applied)} {own.unit}')
         limits = f'limits {own.span_text(own.limits)} {own.unit}' if own.limits else (
             'limits not known')
-        # no minus zero
-        change = round(own.disturbance, own.decimals + 1) + 0.0
-        disturbance = f' · disturbance {change:+.{own.decimals + 1}f} {own.own_unit}' if (
+        change = own.disturbance
+        disturbance = f' · disturbance {change:+z.{own.decimals + 1}f} {own.own_unit}' if (
             math.isfinite(change)) else ''
         details.set_text(limits + disturbance)
         show_if(manual, now.mode == 'manual')

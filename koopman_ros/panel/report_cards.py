@@ -91,9 +91,7 @@ def comparison_card(page: PageLayout) -> None:
     shown = [ReplayComparison()]
 
     def model() -> str:
-        report = page.source.learning.report
-        return (page.source.snapshot.status(TRAINING).values.get('model_file', '')
-                or (report.model_file if report else ''))
+        return page.source.learning.new_model(page.source.snapshot.status(TRAINING).values)[0]
 
     def show(now: Snapshot) -> None:
         found = page.source.learning.comparison

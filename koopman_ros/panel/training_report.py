@@ -60,6 +60,17 @@ class Learning:
     report: TrainingReport | None = None  #: None before the first training
     comparison: ReplayComparison = ReplayComparison()
 
+    def new_model(self, trained: Mapping[str, str]) -> tuple[str, bool]:
+        """
+        Return the file of the last trained model, or '', and whether training rejected it.
+
+        :param trained: figures of the trainer's status, which a restarted trainer has not.
+        """
+        if file := trained.get('model_file', ''):
+            return file, trained.get('accepted') == 'False'
+        found = self.report
+        return (found.model_file, not found.accepted) if found else ('', False)
+
     def picture(self, name: str) -> bytes:
         """Return the picture of a training or a comparison; empty for none."""
         found = {'training': self.report, 'comparison': self.comparison}.get(name)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import colorsys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 import time
 from typing import Any
@@ -38,7 +38,7 @@ _LINES = {'measured': ('solid', 2.0), 'active_setpoints': ('dashed', 1.6),
           'predicted': ('dotted', 1.2), 'planned': ('dotted', 1.6), 'commands': ('solid', 2.0)}
 _ABNORMAL = '#8a4b00'
 # clock of trend_page in the browser
-_CLOCK = ('t => t >= 1e12 ? new Date(t).toTimeString().slice(0, 8) : '
+_CLOCK = ('t => t >= 1e12 ? new Date(t).toISOString().slice(11, 19) : '
           "String(Math.floor(t / 36e5)).padStart(2, '0') + "
           "new Date(t).toISOString().slice(13, 19)")
 _QUIET = '#6b6b67'
@@ -121,6 +121,8 @@ class TrendChart:
         now = self._page.source.snapshot
         faces = {face.name: face for face in (*now.states, *now.inputs)}
         plant_time = latest < EPOCH
+        # wall times are those of the panel, wherever the browser is
+        zone = 0.0 if plant_time else time.localtime(latest).tm_gmtoff
         end = latest if self._end is None else self._end
         # simulated time begins at 0
         begin = max(end - length, 0.0) if plant_time else end - length
@@ -138,20 +140,22 @@ class TrendChart:
                 times, plan = np.reshape(faces[own.signal].plan, (-1, 2)).T
                 values[own.key] = times, plan
         self.marks = grouped(trends.marks(begin, end), _GROUP * (last - first))
+        marks = [replace(mark, time=mark.time + zone) for mark in self.marks]
         self._chart.run_chart_method('setOption', {
-            'useUTC': plant_time,
+            'useUTC': True,
             # without a plan there is no line
             'legend': [{'data': [own.title for own in pens if own.kind != 'planned'
                                  or faces[own.signal].plan]} for _, pens in self._charts],
-            'xAxis': [{'min': 1e3 * begin, 'max': 1e3 * end,
+            'xAxis': [{'min': 1e3 * (begin + zone), 'max': 1e3 * (end + zone),
                        'name': 'plant time' if plant_time else 'wall time'}
                       for _ in self._charts],
             'yAxis': [axis_ends([faces[own.signal].span for own in pens],
                             () if self._whole else [values[own.key][1] for own in pens])
                       for _, pens in self._charts],
-            'series': [{'name': own.title, 'data': _points(*values[own.key]),
+            'series': [{'name': own.title,
+                        'data': _points(values[own.key][0] + zone, values[own.key][1]),
                         'markLine': {'data': _lines(own, faces[own.signal],
-                                                    self.marks if own is pens[0] else ())}}
+                                                    marks if own is pens[0] else ())}}
                        for _, pens in self._charts for own in pens]})
 
 
@@ -286,7 +290,9 @@ def _options(charts: _Charts, height: int, zoom: bool) -> dict[str, Any]:
                     'textStyle': {'color': '#1d1d1b', 'fontSize': 13}, 'icon': 'roundRect',
                     'itemHeight': 14, 'itemWidth': 14}
                    for _, own_pens in charts],
-        'grid': [{'left': 56, 'right': 16, 'height': height - _HEAD - _FOOT} for _ in charts],
+        # all charts have the same width, also below a long name
+        'grid': [{'left': 56, 'right': 16, 'height': height - _HEAD - _FOOT,
+                  'outerBoundsContain': 'axisLabel'} for _ in charts],
         'xAxis': [{'type': 'time', 'gridIndex': at, 'nameLocation': 'middle', 'nameGap': 22,
                    'nameTextStyle': {'color': '#4d4d4a'},
                    'axisPointer': {'label': {':formatter': f'p => ({_CLOCK})(p.value)'}},

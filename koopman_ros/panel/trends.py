@@ -146,6 +146,13 @@ class Trends:
             for marks in self._marks.values():
                 del marks[bisect_right(marks, time, key=_time):]
 
+    def interrupt(self) -> None:
+        """Add a gap after the last value of each pen."""
+        with self._lock:
+            for pen in self._pens.values():
+                if math.isfinite(pen.last):
+                    pen.add(math.nextafter(pen.last, math.inf), math.nan)
+
     def window(self, pens: Iterable[str], begin: float, end: float, buckets: int = 600
                ) -> dict[str, tuple[Array, Array]]:
         """

@@ -36,7 +36,7 @@ def tuning_page(page: PageLayout) -> None:
 def _node(page: PageLayout, node: str) -> None:
     with page.card(node, f'Parameters of the {node}', node):
         with box('row1'):
-            ui.button('Export YAML', on_click=lambda: ui.download.content(
+            export = ui.button('Export YAML', on_click=lambda: ui.download.content(
                 exported(node, page.source.snapshot.parameters.get(node, {})),
                 f'{node}.yaml')).props('outline')
         rows = box('')
@@ -44,6 +44,8 @@ def _node(page: PageLayout, node: str) -> None:
 
     def show(now: Snapshot) -> None:
         found = now.parameters.get(node, {})
+        if export.enabled is not bool(found):
+            export.set_enabled(bool(found))
         if set(found) != set(shown) or not rows.default_slot.children:
             shown.clear()
             rows.clear()

@@ -89,6 +89,8 @@ class LoopViewModel:
         if stamp < self._time - _BACK:
             # a simulation has restarted
             self.trends.rewind(stamp)
+        elif self.conditions.is_silent(PLANT, now):
+            self.trends.interrupt()
         self.conditions.take_message(PLANT, now)
         self._time = stamp
 

@@ -271,6 +271,8 @@ def asks_for_all_that_there_is(desk: Panel, controller: NodeProcess) -> None:
     rejected = desk.ask('setpoint', reactor.TEMPERATURE, 80.0)
     assert re.fullmatch(
         r'rejected: outside 31\.85 to 53\.85 degC, the trained range', str(rejected))
+    # one that the controller would read as no number
+    assert '-273.15 to 10000 degC' in desk.ask('setpoint', reactor.TEMPERATURE, -1e5).text
     # nobody is in the way of an experiment
     desk.wait(lambda: not ros.node.count_publishers(reactor.SETPOINT))
     # manual mode and back

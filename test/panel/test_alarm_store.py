@@ -55,6 +55,16 @@ def test_states_shelving_and_the_list_of_the_day_are_loaded(file: Path) -> None:
     assert len(happened) == 7
 
 
+def test_changes_are_saved_soon_after_a_clock_is_set_back(file: Path) -> None:
+    alarms = Alarms()
+    store = AlarmStore(alarms, file, AGAIN)
+    for key, now in (('new', AGAIN), ('over', AGAIN - 3600.0)):
+        assert alarms.acknowledge(key, 'anna', now)
+        store.save(now)
+        assert (key, 'acknowledged') in [
+            (entry.key, entry.what) for entry in loaded(file).journal(-math.inf)]
+
+
 def test_a_returning_condition_raises_no_second_alarm(file: Path) -> None:
     alarms = loaded(file)
     # nodes take a while until they are heard

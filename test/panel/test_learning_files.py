@@ -136,6 +136,9 @@ def test_a_report_is_followed(base: Path) -> None:
         watch.wait()
         assert watch.learning.report
         assert watch.learning.report.accepted is accepted
+        # a trainer that has started again does not know it
+        assert watch.learning.new_model({}) == ((model, False) if accepted else ('', True))
+        assert watch.learning.new_model({**trained, 'accepted': 'False'})[1]
         assert 'record first' in watch.compare('reactor_nz4').text
     assert 'another training' in watch.learning.report.problem
     watch.complete()

@@ -5,6 +5,7 @@
 
 from collections.abc import Callable, Iterator
 import contextlib
+from dataclasses import replace
 from email.message import Message
 import http.client
 import json
@@ -29,6 +30,7 @@ from websockets.typing import Origin
 
 from koopman_ros.panel import trend_chart
 from koopman_ros.panel.connections import Listener, RateLimiter
+from koopman_ros.panel.layout import clock
 from koopman_ros.panel.server import PanelServer
 from koopman_ros.panel.trend_chart import axis_ends, ink, legend_rows, zoomed
 from koopman_ros.panel.trend_page import time_of_day
@@ -391,15 +393,29 @@ def test_a_page_without_connection_whose_session_ends_asks_to_log_in(
                 waiting.append(attempt)
 
         page.route_web_socket('**', route)
+        # a clock that is set back between two looks
+        page.add_init_script('let now = 1e12; Date.now = () => now -= 3.6e6;')
         page.goto(f'{site.url}/tuning')
         expect(page.locator('#lost')).to_contain_text(
-            'no message from the panel', timeout=PATIENCE)
+            f'no message from the panel since {clock(NOW + 2.0)}.', timeout=PATIENCE)
+        # no control would act later, when the panel is back
+        expect(page.locator('#app')).to_have_attribute('inert', '')
         assert page.request.get(f'{site.url}/session').status == 204
         assert page.request.get(f'{site.url}/logout').ok
         ended.set()
         waiting[0].connect_to_server()
         page.wait_for_url(f'{site.url}/login?page=/tuning')
         browser.forgive()
+
+
+def test_a_page_goes_on_when_the_clock_of_the_panel_is_set_back(
+        site: Site, browser: Pages, monkeypatch: pytest.MonkeyPatch) -> None:
+    with browser.page('about:blank') as page:
+        log_in(page, site)
+        monkeypatch.setattr(site.source, 'snapshot', replace(
+            site.source.snapshot, wall=NOW - 3600.0))
+        expect(page.locator('#beat')).to_have_text(
+            f'wall time {clock(NOW - 3600.0)}', timeout=PATIENCE)
 
 
 DATA = """() => {
@@ -438,6 +454,49 @@ def test_an_hour_is_drawn_with_its_extremes_and_finely_where_it_is_zoomed(
         page.evaluate(ZOOM)
         until(lambda: len(drawn(0.2)) > 30)
         browser.forgive()
+
+
+WIDTHS = """() => {
+    const chart = document.querySelector('.nicegui-echart');
+    const grids = getElement(parseInt(chart.id.slice(1))).chart.getModel().queryComponents(
+        {mainType: 'grid'});
+    return grids.map(grid => grid.coordinateSystem.getRect().width);
+}"""
+
+
+def test_long_names_and_numbers_fit_a_narrow_window(
+        site: Site, browser: Pages, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = site.source.snapshot
+    monkeypatch.setattr(site.source, 'snapshot', replace(now, states=tuple(
+        replace(face, measured=-1.23e18) for face in now.states)))
+    with browser.page('about:blank') as page:
+        page.set_viewport_size({'width': 375, 'height': 800})
+        log_in(page, site)
+        expect(page.locator('.big').first).to_contain_text('-1230000000000000000')
+        assert page.evaluate('document.querySelector(".page").scrollWidth') <= 375
+        until(lambda: len(page.evaluate(WIDTHS)) == 3)
+        assert len(set(page.evaluate(WIDTHS))) == 1
+        browser.forgive()
+
+
+LAST_TIME = """() => {
+    const chart = document.querySelector('.nicegui-echart');
+    const axis = getElement(parseInt(chart.id.slice(1))).chart.getOption().xAxis[0];
+    return axis.max && axis.axisLabel.formatter(axis.max);
+}"""
+
+
+def test_wall_times_of_a_chart_are_those_of_the_panel(
+        site: Site, browser: Pages, monkeypatch: pytest.MonkeyPatch) -> None:
+    with browser.page('about:blank') as page, monkeypatch.context() as changed:
+        changed.setenv('TZ', 'elsewhere-5:30')
+        time.tzset()
+        log_in(page, site)
+        latest = site.source.view.trends.latest
+        assert latest is not None
+        until(lambda: page.evaluate(LAST_TIME) == clock(latest))
+        browser.forgive()
+    time.tzset()
 
 
 @pytest.mark.parametrize(('event', 'window'), [

@@ -7,8 +7,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 import json
 import math
+import sys
 from typing import Any
 
+import numpy as np
 import pytest
 
 from koopman_ros.core.units import display_unit, to_kelvin
@@ -219,7 +221,7 @@ def test_bars_hold_ranges_and_values() -> None:
     assert state.span == pytest.approx((29.8, 56.2))
     assert state.share(43.0) == pytest.approx(0.5)
     assert [state.share(value) for value in (0.0, 99.0, math.nan)] == [0.0, 1.0, 0.0]
-    assert (state.decimals, state.text(43.0)) == (1, '43.0')
+    assert (state.decimals, state.text(43.0), state.text(-0.01)) == (1, '43.0', '0.0')
     assert given.limits == (5.0, 32.0)
     assert given.abnormal == 'at its upper limit'
     # a value that left the range is on the bar, and said to be out
@@ -227,6 +229,19 @@ def test_bars_hold_ranges_and_values() -> None:
     (state,) = own.snapshot(NOW + 2.0).states
     assert state.span[1] == pytest.approx(80.0)
     assert state.abnormal == 'above the trained range'
+
+
+@pytest.mark.parametrize(('value', 'text'), [
+    (sys.float_info.max, '1.79769e+308'), (-sys.float_info.max, '-1.79769e+308'),
+    (5e-324, '0.00'), (math.inf, '–')])
+def test_any_number_is_shown(value: float, text: str) -> None:
+    own = view(TANKS)
+    for setpoint in (value, 1.0, -value):
+        own.take_signals('active_setpoints', {'level_1': setpoint}, 1.0, NOW)
+        own.take_signals('measured', {'level_1': value}, 1.0, NOW)
+        state = own.snapshot(NOW).states[0]
+        assert state.text(state.measured) == text
+        assert 0.0 <= state.share(state.measured) <= 1.0
 
 
 @pytest.mark.parametrize(('bounds', 'text'), [
@@ -328,6 +343,20 @@ def test_a_silence_has_its_node_and_time() -> None:
     assert (silence.since, silence.seen) == (NOW + 19.0, True)
 
 
+def test_a_clock_that_is_set_back_hides_no_silence_and_feigns_none() -> None:
+    own = view()
+    for second in (1.0, 2.0):
+        measure(own, 50.0, second)
+        status(own, CONTROL, OK, 'automatic', {}, NOW + second)
+    back = NOW - 3600.0
+    measure(own, 50.0, 3.0, back + 3.0)
+    own.advance(back + 3.2)
+    assert own.snapshot(back + 3.2).silences == ()
+    own.advance(back + 10.0)
+    assert {(one.role, one.since) for one in own.snapshot(back + 10.0).silences} == {
+        (PLANT, back + 3.0), (CONTROLLER, back + 3.0)}
+
+
 def test_a_slow_plant_is_not_silent_between_its_measurements() -> None:
     own = view()
     for minute in range(1, 5):
@@ -360,6 +389,21 @@ def test_silence_and_levels_are_alarms_by_priority_and_marks() -> None:
     assert standing['silence of plant'] is Priority.HIGH
     assert standing['silence of trainer'] is Priority.LOW
     assert own.snapshot(NOW + 20.0).mode == ''
+
+
+def test_a_simulated_plant_that_is_replaced_leaves_no_alarm() -> None:
+    own = view()
+    for second in range(1, 40):
+        if second < 20:
+            status(own, 'plant: simulation', ERROR, 'stopped', {}, NOW + second)
+        measure(own, 50.0, float(second))
+        status(own, CONTROL, OK, 'automatic', {}, NOW + second)
+        own.advance(NOW + second)
+        now = own.snapshot(NOW + second)
+        if second == 19:
+            assert [alarm.state for alarm in now.standing] == [AlarmState.UNACKNOWLEDGED]
+    assert [alarm.state for alarm in now.standing] == [AlarmState.RETURNED]
+    assert list(now.statuses) == [CONTROL]
 
 
 def test_nodes_of_another_loop_are_ignored() -> None:
@@ -556,6 +600,15 @@ def test_pens_and_marks_are_in_the_time_of_the_plant() -> None:
     assert found['temperature set-point'][1].tolist() == pytest.approx([45.0] * 3)
     assert [(mark.time, mark.text) for mark in own.trends.marks(0.0, 10.0)] == [
         (3.0, 'manual mode')]
+
+
+def test_no_line_is_drawn_across_a_silence_of_the_plant() -> None:
+    own = view()
+    for second in (1.0, 2.0, 100.0, 101.0):
+        measure(own, 50.0 + second, second)
+    times, values = own.trends.window(['temperature'], 0.0, 200.0)['temperature']
+    assert times.tolist() == pytest.approx([1.0, 2.0, 2.0, 100.0, 101.0])
+    assert np.isnan(values).tolist() == [False, False, True, False, False]
 
 
 def test_time_that_begins_again_begins_the_trends_again() -> None:
