@@ -188,7 +188,8 @@ def _control(now: StatusContext) -> tuple[Severity, str]:
                                 f'{action}{doing}; check sensor and plant')
     if report.reason is not None and mode is Mode.MANUAL:
         return Severity.ERROR, f'{mode.value}: {now.reason}'
-    if mode is Mode.AUTOMATIC and report.depth > 0:
+    # the last command may be one of manual mode
+    if mode is report.mode is Mode.AUTOMATIC and report.depth > 0:
         level = Severity.ERROR if report.level in _ACTIONS else Severity.WARN
         action = _WAY_BACK.format(now.input) if report.command.recovery else _action(now)
         return level, f'{action}: {now.reason}'
@@ -230,8 +231,7 @@ def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
             'measurement with its time')
     elif now.timing.silence > overdue or (unmeasured and now.counts.measurements):
         yield MEASUREMENTS, (
-            f'the last measurement is {now.timing.silence:.0f} s old: commands are based on the '
-            'model only; check sensor and plant')
+            f'the last measurement is {now.timing.silence:.0f} s old: check sensor and plant')
     if report.measurement.uncertain:
         yield MEASUREMENTS, (
             f'the quality of {" and ".join(report.measurement.uncertain)} is uncertain: a Kalman '

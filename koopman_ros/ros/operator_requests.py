@@ -58,13 +58,14 @@ class OperatorRequests:
 
     def _on_setpoint(self, received: SignalSample) -> None:
         (name, value), = received.values.items()
+        # only a stamp of the sender schedules it
+        stamp_ns = received.stamp_ns if received.stamped else 0
         several = len(self._signals.controlled) > 1
         if self._change(events.SetpointRequest(
-                received.stamp_ns, np.array([value]), (name,) if several else None)):
+                stamp_ns, np.array([value]), (name,) if several else None)):
             self.setpoint_received = True
-            scheduled = any(entry[0] == received.stamp_ns
-                            for entry in self._loop.state.setpoint.scheduled)
-            when = f', effective from {received.stamp_ns / NANOSECONDS:.3f} s' if scheduled else ''
+            scheduled = any(entry[0] == stamp_ns for entry in self._loop.state.setpoint.scheduled)
+            when = f', effective from {stamp_ns / NANOSECONDS:.3f} s' if scheduled else ''
             unit = self._signals.states[name]
             self._log.info(
                 f'set-point {quantity_text(value, unit)} of {name} accepted{when}',

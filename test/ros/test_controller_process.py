@@ -15,7 +15,7 @@ import pytest
 from rcl_interfaces.srv import DescribeParameters
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, Temperature
-from std_msgs.msg import String
+from std_msgs.msg import Float64, String
 
 from koopman_ros.core.units import LAST_STAMP_SECONDS
 from koopman_ros.demo import reactor
@@ -330,6 +330,21 @@ def test_a_loop_runs_on_its_own_clock_with_a_sensor_that_reports_on_change(
     now, before = now - 900.0, silence()
     pass_until(lambda: silence() > before + 1.5, 0.01)
     assert now < 1000.0
+
+
+def test_a_setpoint_without_a_stamp_takes_effect_at_once(ros: Harness, run_node: RunNode) -> None:
+    run_node(ControllerNode, {
+        'temperature.type': 'std_msgs/msg/Float64', 'temperature.unit': 'degC'})
+    records = ros.listen(String, topics.EVENT_LOG)
+    commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
+    thermometer, setpoint = (ros.speak(Float64, topic, to='controller') for topic in (
+        reactor.TEMPERATURE, reactor.SETPOINT))
+    thermometer.publish(Float64(data=STEADY))
+    ros.wait_until(lambda: commands)
+    setpoint.publish(Float64(data=STEADY - 5.0))
+    # not at its arrival in the time of the measurements, which another clock may give
+    ros.wait_until(lambda: [record.fields['stamp_ns'] for record in map(
+        parse, (message.data for message in records)) if record.event == 'setpoint'] == [0])
 
 
 def test_a_signal_reported_on_change_is_in_each_measurement_and_a_late_one_in_the_estimate(

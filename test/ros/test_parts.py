@@ -238,6 +238,12 @@ def test_another_law_is_a_warning_and_no_law_an_error(depth: int, severity: Seve
     assert statuses(context(own, state, lower))['control'].level is severity
 
 
+def test_automatic_mode_is_in_order_before_its_first_command() -> None:
+    own, state, report = measured(Mode.MANUAL)
+    found = statuses(context(own, own.set_mode(state, Mode.AUTOMATIC), report))['control']
+    assert (found.level, found.message) == (Severity.OK, 'automatic')
+
+
 @pytest.mark.parametrize(('degrees', 'outside', 'words'), [
     (45.0, 0.07, ''), (45.0, 0.11, 'far from the training data'),
     (54.5, 0.06, 'outside the trained range'), (45.0, 0.0, '')])
