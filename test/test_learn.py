@@ -124,6 +124,22 @@ def test_inputs_that_moved_together_are_not_moved_apart_by_dead_times(folder, ca
     assert 'pump and fan moved together' in capsys.readouterr().err
 
 
+@pytest.mark.parametrize('seed', [3, 5])
+def test_a_record_that_the_inputs_do_not_explain_is_rejected(folder, capsys, seed):
+    noise = np.random.default_rng(seed).standard_normal(N)
+    table(0).assign(**{'level [m]': noise}).to_csv('day.csv', index=False)
+    assert learned('--unmeasured_states', '0') == 2
+    assert 'the inputs explain nothing of the held-out data' in capsys.readouterr().out
+
+
+def test_a_drift_that_overflows_gives_no_warning(folder):
+    noise = np.random.default_rng(4).standard_normal(N)
+    table(0).assign(**{'level [m]': noise}).to_csv('day.csv', index=False)
+    with quick_retraining(4, degrees=(1, 3)):
+        assert learn.main(['day.csv', '--states', 'level', '--inputs', 'pump', '--model_class',
+                           'linear', '--unmeasured_states', '0']) == 2
+
+
 @pytest.mark.usefixtures('folder')
 def test_a_present_model_names_the_signals_and_has_to_be_beaten(day, capsys):
     assert learned('--model', str(day[0] / 'day.safetensors'), '--model_class', 'same',

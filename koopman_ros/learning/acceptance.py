@@ -60,6 +60,8 @@ _LEAST_AUTOCORRELATION = 0.3
 _MOST_ALTERNATIVES = 5
 # Rounds of closed loops, at least, from which the share of failures is stated.
 _ROUNDS = 4
+# Share by which moving inputs must lower the error of one state, compared with constant ones.
+_LEAST_EFFECT = 0.02
 # A share of the set-points' range that may be missing: noise moves the ends of a record.
 _MISSING = 0.05
 
@@ -170,6 +172,16 @@ class HeldOut:
         return {drift.form: drift.rate for drift in drifts
                 if _size(self.rmse(drift.rate), self.scale) <= _size(rmse, self.scale)}
 
+    def without_effect(self, model: LiftedModel, rmse: Array) -> str:
+        """Say that a model predicts as well under constant inputs, or nothing."""
+        rate, mean = lifted_rate(model, self._seconds), np.mean(self.segments.u, axis=(0, 1))
+        constant = self.rmse(lambda x, u: rate(x, np.broadcast_to(mean, np.shape(u))))
+        if not np.all(np.isfinite(rmse)) or np.any(rmse < (1.0 - _LEAST_EFFECT) * constant):
+            return ''
+        return ('the inputs explain nothing of the held-out data: its error, '
+                f'{_text(rmse, model)}, is {_text(constant, model)} under constant inputs: record '
+                'larger steps of the inputs, held longer, or the inputs that act')
+
     def exceeded(self, model: LiftedModel, name: str, rmse: Array, other: Array, remedy: str
                  ) -> str:
         """Say that an error is not clearly below another one, or nothing."""
@@ -187,8 +199,14 @@ class HeldOut:
         :param rmse: (n_x,) error of its predictions, in state units.
         :param linear: whether it is a linear one itself, which need not be better than that.
         """
-        reasons = [unusable(model)] + ([] if linear else [self.exceeded(
-            model, 'the best linear model', rmse, self.linear_rmse, 'set model_class to linear')])
+        reasons = [unusable(model)]
+        if not linear:
+            reasons.append(self.exceeded(model, 'the best linear model', rmse, self.linear_rmse,
+                                         'set model_class to linear'))
+        elif not np.all(np.isfinite(rmse)):
+            reasons.append('its predictions of held-out data diverge: record steps of the inputs '
+                           'that do not depend on the states')
+        reasons.append(self.without_effect(model, rmse))
         cond, most = figures.fit.cond, self._thresholds.condition * figures.fit.cond_of_states
         # monomials depend on each other on most data, and only learned coordinates collapse
         if not (cond <= most or isinstance(model.observables, PolynomialObservables)):

@@ -78,7 +78,9 @@ def retrain(task: TrainingTask, on_progress: OnProgress | None = None, *,
     :raises SchedulerLost: when a scheduler is not reached, or lost; nothing is written then.
     """
     checked_device(task.device)
-    with backend_of(task.executor) as backend, progress_line() as report:
+    # a drift that diverges is found by its values
+    with (np.errstate(all='ignore'), backend_of(task.executor) as backend,
+          progress_line() as report):
         return _retrain(backend, task, on_progress or (lambda *now: bool(report(*now))), record,
                         test)
 

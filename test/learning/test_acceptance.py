@@ -16,7 +16,7 @@ from koopman_ros.core.datasets import Episode
 from koopman_ros.core.paths import model_path
 from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest
 from koopman_ros.learning import Edmd, evaluate_model, learn_lift, Thresholds
-from koopman_ros.learning.acceptance import uncovered_setpoints
+from koopman_ros.learning.acceptance import HeldOut, uncovered_setpoints
 from koopman_ros.learning.drift_sampling import _spread, drift_samples
 from koopman_ros.learning.ensemble import disagreement
 from koopman_ros.learning.identification import (
@@ -137,6 +137,16 @@ def test_the_present_lift_does_not_beat_itself(found, trained):
         f'its error on held-out data, {own}, is not 10 % below that of the current model, '
         f'{own}: keep that one, or reduce acceptance_margin',)
     assert evaluate_model(found, trained, trained.model, Thresholds(margin=0.0)).accepted
+
+
+@pytest.mark.usefixtures('no_loops')
+@pytest.mark.parametrize(('error', 'accepted'), [(NOISE, True), (np.inf, False)])
+def test_a_linear_model_whose_predictions_diverge_is_rejected(found, trained, error, accepted):
+    check = evaluate_model(found, trained, None, Thresholds()).law_check
+    reasons = HeldOut(found, Thresholds(), compared=False).reasons(
+        trained.model, np.array([error]), trained.figures, check, linear=True)
+    assert (not reasons) == accepted
+    assert ('diverge' in ' '.join(reasons)) != accepted
 
 
 @pytest.mark.usefixtures('no_loops')
