@@ -45,7 +45,7 @@ from koopman_ros.panel.view_model import LoopViewModel
 from koopman_ros.parameters.panel import panel_signals, panel_table
 from koopman_ros.parameters.signal_topics import SignalTopics, words_of
 from koopman_ros.parameters.table import ConfigurationError
-from koopman_ros.ros import topics
+from koopman_ros.ros import remote_node, topics
 from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.node import LoopNode
@@ -304,14 +304,20 @@ class PanelNode(LoopNode):
             reply(self._watch.cancel())
         elif action.what == 'parameters':
             self._nodes[action.name].set_parameters(action.value, lambda response: reply(
-                _not_running(action.name) if response is None else Answer(
+                self._unanswered(action.name) if response is None else Answer(
                     response.result.successful, response.result.reason or 'set')))
         else:
             role, service, kind = _SERVICES[action.what]
             request = kind.Request() if kind is Trigger else kind.Request(data=bool(action.value))
             self._nodes[role].call(service, request, lambda response: reply(
-                _not_running(role) if response is None else Answer(
+                self._unanswered(role) if response is None else Answer(
                     response.success, response.message)))
+
+    def _unanswered(self, role: str) -> Answer:
+        if not self._nodes[role].running:
+            return _not_running(role)
+        return Answer(False, f'the {role} did not answer within {remote_node.TIMEOUT:g} s: check '
+                             'its log; it may still carry out the request')
 
     def _send(self, action: Action, reply: Callable[[Answer], None]) -> None:
         """Publish a set-point or a manual command until the controller answers."""

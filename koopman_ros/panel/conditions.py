@@ -4,7 +4,7 @@
 """Conditions of a loop that raise alarms: statuses, repeated errors, and silence of nodes."""
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import re
 
 from koopman_ros.panel.alarms import Alarms, Priority
@@ -92,7 +92,8 @@ class Conditions:
         # other nodes cannot crowd out the loop's
         alike = [task for task in self.statuses
                  if (task.partition(':')[0] in ROLES) is (role is not None)]
-        if not name or (name not in alike and len(alike) >= _MAX_TASKS):
+        if not name or (name not in alike and len(alike) >= _MAX_TASKS and not (
+                level > OK and self._forget_one(alike))):
             return
         if role in (CONTROLLER, TRAINER):
             self.take_message(role, now)
@@ -121,6 +122,15 @@ class Conditions:
             self.alarms.report(key, active and key in texts, priority,
                                f'{name}: {texts.get(key, "")}', now)
         self._keys[name] = tuple(texts)
+
+    def _forget_one(self, tasks: Sequence[str]) -> bool:
+        """Make room for an alarm: forget a task without one; return whether there was any."""
+        name = next((task for task in tasks if self.statuses[task].level == OK
+                     and task not in self._errors), None)
+        if name is None:
+            return False
+        del self.statuses[name], self._since[name], self._keys[name]
+        return True
 
     def _is_alarm(self, status: TaskStatus, now: float) -> bool:
         """Return whether a warning or an error is an alarm, and no other alarm shows it."""

@@ -19,7 +19,7 @@ from koopman_ros.panel.faceplates import readable
 from koopman_ros.panel.layout import AnswerLine, box, label, PageLayout, show_if
 from koopman_ros.panel.model_card import model_changes, status_card, training_card, training_ranges
 from koopman_ros.panel.report_cards import comparison_card, report_card
-from koopman_ros.panel.requests import Answer
+from koopman_ros.panel.requests import Action, Answer
 from koopman_ros.panel.snapshot import (
     CONTROL,
     CONTROLLER,
@@ -131,10 +131,14 @@ def _model(page: PageLayout) -> None:
             wanted = {'model': name, **({_FORCE: True} if rejected else {})}
             old = {key: now.parameter(CONTROLLER, key) for key in wanted}
             answer.set_text('sent …')
-            answer.show(await page.act('parameters', CONTROLLER, wanted, old))
-            if old.get(_FORCE) is False:
-                # for this model alone
-                await page.act('parameters', CONTROLLER, {_FORCE: False}, {_FORCE: True})
+            forced = old.get(_FORCE) is False and page.visitor.may_act()
+            try:
+                answer.show(await page.act('parameters', CONTROLLER, wanted, old))
+            finally:
+                if forced:
+                    # for this model alone, also where the page was closed
+                    page.source.request(Action(page.visitor.name, 'parameters', CONTROLLER,
+                                               {_FORCE: False}, {_FORCE: True}))
 
         def trained() -> tuple[str, bool]:
             status = page.source.snapshot.status(TRAINING)

@@ -25,7 +25,10 @@ def trend_page(page: PageLayout) -> None:
                 'aria-label="Time shown" unelevated color=grey-5 text-color=black '
                 'toggle-color=grey-9')
             whole = ui.checkbox('whole range')
-            until = ui.input('Until, h:mm:ss', placeholder='now').props('outlined dense')
+            until = ui.input('Until, h:mm:ss', placeholder='now', validation={
+                'not h:mm:ss or h:mm': lambda text: not text or time_of_day(
+                    str(text), page.source.view.trends.latest or 0.0) is not None}).props(
+                        'outlined dense')
             earlier = ui.button('Earlier').props('outline')
             later = ui.button('Later').props('outline')
             ui.button('Now', on_click=lambda: until.set_value('')).props('outline')

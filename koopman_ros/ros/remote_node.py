@@ -24,7 +24,7 @@ from rclpy.task import Future
 
 from koopman_ros.parameters.description import ParameterDescription
 
-_TIMEOUT = 30.0  # s until a response counts as lost
+TIMEOUT = 30.0  #: s until a response counts as lost
 _CHOICES = 'one of '  # at the beginning of the range of a choice
 _OF_RCLPY = ('qos_overrides', 'use_sim_time', 'start_type_description_service')
 
@@ -76,6 +76,11 @@ class RemoteNode:
         self._stale, self._reading = True, False
         self._known = False
 
+    @property
+    def running(self) -> bool:
+        """Whether the node offers its services; it may still not respond."""
+        return all(client.service_is_ready() for client in self._clients.values())
+
     def call(self, service: str, request: Any, on_response: Callable[[Any], None]) -> None:
         """Call a service; `on_response` is called with its response, or with None for none."""
         client = self._clients[service]
@@ -83,7 +88,7 @@ class RemoteNode:
             on_response(None)
             return
         future = client.call_async(request)
-        self._waiting[future] = (time.monotonic() + _TIMEOUT, on_response)
+        self._waiting[future] = (time.monotonic() + TIMEOUT, on_response)
         future.add_done_callback(self._on_done)
 
     def set_parameters(self, values: Mapping[str, Any],

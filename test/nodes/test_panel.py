@@ -37,7 +37,7 @@ from koopman_ros.nodes import panel
 from koopman_ros.nodes.panel import PanelNode
 from koopman_ros.panel.requests import Action, Answer
 from koopman_ros.panel.snapshot import CONTROLLER, TRAINER
-from koopman_ros.ros import topics
+from koopman_ros.ros import remote_node, topics
 from koopman_ros.ros.controller_status import TASKS
 from koopman_ros.testing import Harness, NodeProcess
 from support.browser import ADDRESS
@@ -226,7 +226,7 @@ class Panel:
 def test_requests_of_the_panel_are_executed_and_audited(
         ros: Harness, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     controller = ros.start('controller')
-    ros.start('trainer', {'output': tmp_path / 'bag'})
+    trainer = ros.start('trainer', {'output': tmp_path / 'bag'})
     ask = ros.speak(Temperature, reactor.SETPOINT, to='controller', subscribers=2)
     reports: list[DiagnosticArray] = ros.listen(DiagnosticArray, topics.DIAGNOSTICS)
     heard: list[Temperature] = ros.listen(Temperature, reactor.TEMPERATURE)
@@ -240,6 +240,11 @@ def test_requests_of_the_panel_are_executed_and_audited(
     desk = Panel(ros, monkeypatch)
     try:
         asks_for_all_that_there_is(desk, controller)
+        # one that hangs is not told from a lost one by starting another
+        monkeypatch.setattr(remote_node, 'TIMEOUT', 1.0)
+        trainer.process.send_signal(signal.SIGSTOP)
+        assert 'did not answer within 1 s' in desk.ask('cancel', TRAINER).text
+        trainer.process.send_signal(signal.SIGCONT)
     finally:
         desk.close()
 

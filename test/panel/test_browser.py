@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import json
 from pathlib import Path
 import re
+import signal
 import time
 import warnings
 
@@ -36,6 +37,7 @@ TRAINER = {
     'min_free_disk': 0.0, 'experiment_signal': 'setpoint',
     'experiment_length': 900.0, 'experiment_min_hold_time': 20.0, 'experiment_max_hold_time': 60.0,
     'temperature.setpoint_min': 40.0, 'temperature.setpoint_max': 50.0}
+CLOSED = 13_000.0  # ms until the panel drops a closed page
 TRIES = 3
 MARKUP = '<script>document.title="caught"</script><b>bold</b>'
 
@@ -281,6 +283,18 @@ def test_a_model_is_recorded_trained_compared_activated_and_replaced(site: Site)
         activated(page, re.compile('Back to .*bad'), 'rejected this model: too inaccurate',
                   'rejected', yes='Activate by force')
         ros.wait_until(lambda: ros.get_parameters('controller', 'load_rejected_model') == [False])
+        activated(page, re.compile('Back to reactor'))
+        # nor does force last where the page is closed before the controller responds
+        press(model, re.compile('Back to .*bad'))
+        site.controller.process.send_signal(signal.SIGSTOP)
+        press(page.get_by_role('dialog'), 'Activate by force')
+        expect(model.locator('.answer')).to_have_text('sent …')
+        page.goto('about:blank')
+        page.wait_for_timeout(CLOSED)
+        site.controller.process.send_signal(signal.SIGCONT)
+        ros.wait_until(lambda: ros.get_parameters(
+            'controller', 'model', 'load_rejected_model') == [str(bad), False])
+        page.goto(f'{site.url}/model')
         activated(page, re.compile('Back to reactor'))
         press(recording, 'Record')
         expect(recording).to_contain_text('recording to')

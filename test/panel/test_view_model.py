@@ -446,6 +446,12 @@ def test_statuses_of_other_nodes_crowd_out_none_of_the_own_loop() -> None:
     now = own.snapshot(NOW + 2.0)
     assert {alarm.key for alarm in now.standing} == {f'{CONTROL}: held', 'controller: actuators'}
     assert len(now.statuses) < 100
+    # nor do those without a fault any that has one
+    for second in range(3):
+        status(own, 'driver_199: io', ERROR, 'down', {}, NOW + 3.0 + second)
+        own.advance(NOW + 3.0 + second)
+    assert 'driver_199: io' in [alarm.key for alarm in own.snapshot(NOW + 6.0).standing]
+    assert len(own.snapshot(NOW + 6.0).statuses) == len(now.statuses)
 
 
 def test_a_warning_has_one_alarm_whatever_else_is_wrong() -> None:
