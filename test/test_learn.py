@@ -129,7 +129,7 @@ def test_a_record_that_the_inputs_do_not_explain_is_rejected(folder, capsys, see
     noise = np.random.default_rng(seed).standard_normal(N)
     table(0).assign(**{'level [m]': noise}).to_csv('day.csv', index=False)
     assert learned('--unmeasured_states', '0') == 2
-    assert 'the inputs explain nothing of the held-out data' in capsys.readouterr().out
+    assert 'the inputs explain nothing of the record' in capsys.readouterr().out
 
 
 def test_a_drift_that_overflows_gives_no_warning(folder):

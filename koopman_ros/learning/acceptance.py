@@ -60,8 +60,6 @@ _LEAST_AUTOCORRELATION = 0.3
 _MOST_ALTERNATIVES = 5
 # Rounds of closed loops, at least, from which the share of failures is stated.
 _ROUNDS = 4
-# Share by which moving inputs must lower the error of one state, compared with constant ones.
-_LEAST_EFFECT = 0.02
 # A share of the set-points' range that may be missing: noise moves the ends of a record.
 _MISSING = 0.05
 
@@ -172,15 +170,26 @@ class HeldOut:
         return {drift.form: drift.rate for drift in drifts
                 if _size(self.rmse(drift.rate), self.scale) <= _size(rmse, self.scale)}
 
-    def without_effect(self, model: LiftedModel, rmse: Array) -> str:
-        """Say that a model predicts as well under constant inputs, or nothing."""
-        rate, mean = lifted_rate(model, self._seconds), np.mean(self.segments.u, axis=(0, 1))
-        constant = self.rmse(lambda x, u: rate(x, np.broadcast_to(mean, np.shape(u))))
-        if not np.all(np.isfinite(rmse)) or np.any(rmse < (1.0 - _LEAST_EFFECT) * constant):
+    def without_effect(self, model: LiftedModel) -> str:
+        """
+        Say that inputs do not explain the record by the Bayesian criterion, or nothing.
+
+        A model of noise errs a little less on its own data than under constant inputs.
+        """
+        episodes = self._found.episodes
+        segments = Segments.of(episodes, longest_step(episodes))
+        rate, mean = lifted_rate(model, self._seconds), np.mean(segments.u, axis=(0, 1))
+        own, constant = (prediction_error(one, segments, self.scale) for one in (
+            rate, lambda x, u: rate(x, np.broadcast_to(mean, np.shape(u)))))
+        samples = np.sum(segments.measured, axis=(0, 1))
+        parameters = model.n_x * (model.n_x + len(mean))
+        # a model that diverges has a reason of its own
+        if not np.all(np.isfinite(own)) or not (
+                samples @ np.log((constant / own) ** 2) <= parameters * np.log(samples.sum())):
             return ''
-        return ('the inputs explain nothing of the held-out data: its error, '
-                f'{_text(rmse, model)}, is {_text(constant, model)} under constant inputs: record '
-                'larger steps of the inputs, held longer, or the inputs that act')
+        return (f'the inputs explain nothing of the record: its error, {_text(own, model)}, is '
+                f'{_text(constant, model)} under constant inputs: record larger steps of the '
+                'inputs, held longer, or the inputs that act')
 
     def exceeded(self, model: LiftedModel, name: str, rmse: Array, other: Array, remedy: str
                  ) -> str:
@@ -206,7 +215,7 @@ class HeldOut:
         elif not np.all(np.isfinite(rmse)):
             reasons.append('its predictions of held-out data diverge: record steps of the inputs '
                            'that do not depend on the states')
-        reasons.append(self.without_effect(model, rmse))
+        reasons.append(self.without_effect(model))
         cond, most = figures.fit.cond, self._thresholds.condition * figures.fit.cond_of_states
         # monomials depend on each other on most data, and only learned coordinates collapse
         if not (cond <= most or isinstance(model.observables, PolynomialObservables)):

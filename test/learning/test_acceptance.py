@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from koopman_ros.core.datasets import Episode
+from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.paths import model_path
 from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest
 from koopman_ros.learning import Edmd, evaluate_model, learn_lift, Thresholds
@@ -147,6 +147,26 @@ def test_a_linear_model_whose_predictions_diverge_is_rejected(found, trained, er
         trained.model, np.array([error]), trained.figures, check, linear=True)
     assert (not reasons) == accepted
     assert ('diverge' in ' '.join(reasons)) != accepted
+
+
+@pytest.mark.parametrize(('gain', 'explains'), [(5.0, True), (0.0, False)])
+def test_inputs_explain_a_record_whose_segments_move_less_than_its_noise(gain, explains):
+    """A slow oven in noise; over a held-out segment its inputs lower the error by 0.2 %."""
+    rng = np.random.default_rng(0)
+    u, x, decay = np.repeat(rng.uniform(-1.0, 1.0, 10), 60), np.zeros(600), np.exp(-1.0 / 300.0)
+    for k in range(599):
+        x[k + 1] = decay * x[k] + (1.0 - decay) * gain * u[k]
+    time = np.arange(600.0)
+    oven = PlantDescription('oven', ('T',), ('K',), ('P',), ('V',), 's', np.full(1, np.nan),
+                            np.full(1, np.nan), None)
+    estimate = identify(oven, [Episode(
+        time, (x + 0.3 * rng.standard_normal(600))[:, None], time, u[:, None])], degrees=(1,),
+        methods=methods(20))
+    model = Edmd(1).learn(
+        replace(oven, nominal_state=np.zeros(1), nominal_input=np.zeros(1),
+                B=estimate.drift.input_matrix), drift_samples(estimate.drift, estimate.fitted))
+    reason = HeldOut(estimate, Thresholds(), compared=False).without_effect(model)
+    assert ('the inputs explain nothing of the record' in reason) is not explains
 
 
 @pytest.mark.usefixtures('no_loops')
