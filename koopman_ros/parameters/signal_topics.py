@@ -284,6 +284,12 @@ class SignalTopics:
                 if found.topic in used:
                     return (f'{name} is commanded on {found.topic!r}, the topic on which '
                             f'{used[found.topic]} is measured: change one of them')
+            for places in ({**self.measured, **self.measured_disturbances}, self.commands):
+                names: dict[tuple[str, str], str] = {}
+                for name, found in places.items():
+                    if (other := names.setdefault((found.topic, found.field), name)) != name:
+                        return (f'{other} and {name} are both in the field {found.field} of '
+                                f'{found.topic!r}: set another topic or field for one of them')
         except ValueError as error:
             return str(error)
         return ''

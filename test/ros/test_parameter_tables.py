@@ -309,6 +309,18 @@ def test_values_that_do_not_fit_together_are_rejected(
     assert re.search(words, table.check(table.snapshot(given)))
 
 
+@pytest.mark.parametrize(('given', 'words'), [
+    # of jacket_temperature [K], too, the command is that of the jacket
+    ({'states_measured': ('T [K]',), 'inputs_commanded': ('jacket [K]', 'jacket_temperature [K]')},
+     "jacket and jacket_temperature are both in the field temperature of 'jacket_setpoint'"),
+    ({'states_measured': ('a [m]', 'b [m]'), 'inputs_commanded': ('u [V]',), 'a.topic': 'levels',
+      'b.topic': 'levels', 'b.field': 'position[a]'},
+     "a and b are both in the field position[a] of 'levels'")])
+def test_two_signals_in_one_place_are_rejected(given: dict[str, Any], words: str) -> None:
+    table = trainer_table(None, {'system': '', **given})
+    assert words in table.check(table.snapshot(given))
+
+
 def test_measured_disturbances_have_rows_topics_and_a_place_in_the_task() -> None:
     named = {'system': 'reactor', 'disturbances_measured': ('feed_temperature [K]',)}
     trainer = trainer_table(load(model_path(reactor.MODEL)), named)
