@@ -165,6 +165,14 @@ def _hats(found: Identified, names: Sequence[str], count: int) -> Hats | None:
 
 def _better(found: Identified, functions: Hats, drift: DriftModel) -> DriftModel | None:
     """Return a drift with functions of inputs added; None if it does not err less."""
+    try:
+        return _clearly_better(found, functions, drift)
+    except np.linalg.LinAlgError:
+        # a simulation that is lost, of an unstable plant, shows no characteristic
+        return None
+
+
+def _clearly_better(found: Identified, functions: Hats, drift: DriftModel) -> DriftModel | None:
     episodes, step = found.episodes, longest_step(found.fitted)
     more = [functions.added(one) for one in episodes]
     box = replace(drift.box, inputs=functions.coordinates())

@@ -23,6 +23,7 @@ from koopman_ros.model import load
 from koopman_ros.records import read, RecordedInput, RecordedState
 from support.known_plants import methods
 from support.quick_retraining import quick_retraining
+from support.sampling import sampled
 
 PERIOD, SAMPLES, HOLD, NOISE = 0.2, 600, 6, 0.01
 PLANT = PlantDescription('tank', ('level',), ('m',), ('valve',), ('1',), 's', np.full(1, np.nan),
@@ -47,6 +48,28 @@ def record(rate, low, high, seed=0):
 def identified(episode, plant=PLANT, **options):
     return identify_with_characteristics(plant, [episode], degrees=(1,), methods=methods(20),
                                          **options)
+
+
+def test_an_unstable_plant_whose_simulation_is_lost_has_none():
+    """A magnet that holds a ball, in closed loop for 528 of its time constants."""
+    rate, period, count = 44.0, 0.004, 3000
+    A = np.array([[0.0, 1.0], [rate ** 2, 0.0]])
+    step, gain = sampled(A, np.array([[0.0], [rate ** 2]]), period)
+    rng, noise = np.random.default_rng(0), np.array([1e-3, 1e-3 * rate])
+    goal = np.repeat(rng.uniform(-1.0, 1.0, count // 40), 40)
+    x, u = np.zeros((count, 2)), np.zeros(count)
+    for k in range(count):
+        gap, speed = x[k] + noise * rng.standard_normal(2)
+        u[k] = -goal[k] - 3.0 * (gap - goal[k]) - 2.0 / rate * speed
+        if k + 1 < count:
+            x[k + 1] = step @ x[k] + gain[:, 0] * u[k]
+    time = period * np.arange(count)
+    plant = replace(PLANT, state_names=('gap', 'speed'), state_units=('1', '1'),
+                    nominal_state=np.full(2, np.nan))
+    found = identified(Episode(time, x + noise * rng.standard_normal(x.shape), time, u[:, None]),
+                       plant)
+    assert not found.drift.characteristics
+    assert found.drift.input_matrix[1, 0] == pytest.approx(rate ** 2, rel=0.1)
 
 
 @pytest.mark.parametrize(('g', 'exact'), [
