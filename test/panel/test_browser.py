@@ -377,7 +377,7 @@ def test_an_alarm_is_raised_shelved_shown_again_acknowledged_and_gone(site: Site
             row.get_by_role('button', name='Acknowledge').click()
             expect(own).to_contain_text('MEDIUM')
             fits(page)
-            expect(page.get_by_role('link', name=re.compile(r'Alarms \(\d\)'))).to_be_visible()
+            expect(page.get_by_role('link', name=re.compile(r'Alarms \(\d+\)'))).to_be_visible()
             expect(own.get_by_role('button', name='Shelve 8 h')).to_be_visible()
             own.get_by_role('button', name='Shelve 10 min').click()
             expect(own).to_have_count(0)
