@@ -111,6 +111,13 @@ def test_rate_of_a_state_that_has_diverged(shipped):
         rates[[0, 4]], lifted_rate(shipped, 60.0)(x[[0, 4]], u[[0, 4]]), rtol=1e-13)
 
 
+def test_a_linear_model_has_a_rate_everywhere(shipped):
+    linear = shipped.linearised
+    x = linear.states.to_physical(np.array([[1e3], [1e9]]))
+    rates = lifted_rate(linear, 60.0)(x, np.tile(linear.inputs.center, (2, 1)))
+    assert rates[1] == pytest.approx(1e6 * rates[0])
+
+
 def test_a_better_lift_is_accepted(found, trained, shipped):
     decision = evaluate_model(found, trained, shipped, Thresholds(), loops=8)
     assert decision.accepted

@@ -141,13 +141,15 @@ def lifted_rate(model: LiftedModel, time_unit_seconds: float) -> Rate:
     """
     Return dx/dt of a model's drift, in units and per a time unit given in seconds.
 
-    It is NaN for states that have diverged: their pseudo-inverse does not exist.
+    It is NaN for states that have diverged: their pseudo-inverse does not exist. A linear model
+    has a rate everywhere: that of an unstable plant diverges from starts that are not fitted yet.
     """
     factor = time_unit_seconds / model.seconds_per_time_unit
+    limit = np.inf if model.observables.features.n_z == model.n_x else _DIVERGED
 
     def rate(x: Array, u: Array) -> Array:
         xi = model.states.to_deviation(x)
-        followed = np.all(np.abs(xi) < _DIVERGED, axis=-1, keepdims=True)
+        followed = np.all(np.abs(xi) < limit, axis=-1, keepdims=True)
         xi = np.where(followed, xi, 0.0)
         found = model.drift(xi) + model.forcing(xi, model.inputs.to_deviation(u))
         scaled: Array = factor * model.states.scale * np.where(followed, found, np.nan)
