@@ -38,7 +38,9 @@ _LOST = 1e3  # error of a start that diverges, in half-ranges
 # The first samples of another day err by more than so many times the usual error. A steady state
 # that is a half-range elsewhere then counts as much as such an error of a sample.
 _OTHER_DAY = 1.5
-_FINEST = 50.0  # steps of a simulation in two samples
+# A Runge-Kutta step of a sample, as in the identification, follows motion up to this angle in it;
+# of faster motion, it takes up to so many steps in two samples.
+_RESOLVED, _FINEST = 2.0, 50.0
 _PICTURED = 3  # episodes of a picture
 
 
@@ -215,8 +217,8 @@ def _step(rate: Rate, states: Coordinates, episodes: Sequence[Episode]) -> float
     fastest = max(float(np.max(np.abs(np.linalg.eigvals(differences(
         lambda x: rate(x, u), point, states.scale))))) for point in points)
     longest = longest_step(episodes)
-    # no slower than this, however stiff it is
-    return longest / min(max(1.0, fastest * longest), _FINEST)
+    turn = fastest * longest
+    return longest if turn <= 2.0 * _RESOLVED else longest / min(turn, _FINEST)
 
 
 def _usual(model: AnyModel, names: Sequence[str]) -> Array | None:
