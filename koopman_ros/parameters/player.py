@@ -74,7 +74,8 @@ def _check_player(values: PlayerParameters) -> str:
                 'and answer to their topics, or rate above 0')
     if values.clock and not all(values.measurement):
         return 'clock publishes the stamps of measurements: set measurement to their topics'
-    return rejection(values.topics)
+    return rejection(values.topics) or (
+        rejection(values.measurement) if any(values.measurement) else '')
 
 
 def player_table(given: Mapping[str, Any] = MappingProxyType({})

@@ -288,6 +288,8 @@ def test_setpoints_of_a_csv_are_due_in_the_time_of_a_simulation(
     ({'system': 'none', 'topics': ['temperature'], 'rate': 0.0}, 'set measurement and answer'),
     ({'system': 'none', 'topics': ['temperature'], 'clock': True}, 'set measurement'),
     ({'system': 'none'}, "topics = ['']"),
+    ({'measurement': ['temperature', '']},
+     "topics = ['temperature', ''] must contain at least one name and no empty one"),
     ({'rate': -1.0}, 'rate = -1.0 must be 0, or in [1e-06, 10000]'),
     ({'wait_timeout': 0.1}, '/temperature found no subscriber or publisher within 0.1 s'),
     ({'wait_for_subscribers': 0, 'rate': 0.0, 'answer_timeout': 0.1},
