@@ -211,11 +211,9 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | 
 def _step(rate: Rate, states: Coordinates, episodes: Sequence[Episode]) -> float:
     """Return a step over which a Runge-Kutta method follows samples and the model's motion."""
     middle, half = 0.5 * (states.upper + states.lower), 0.5 * (states.upper - states.lower)
-    u = np.repeat(episodes[0].u[:1], len(states), axis=0)
     n = len(half)
     points = middle + half * np.vstack([np.zeros(n), np.eye(n), -np.eye(n)])
-    fastest = max(float(np.max(np.abs(np.linalg.eigvals(differences(
-        lambda x: rate(x, u), point, states.scale))))) for point in points)
+    fastest = max(float(np.max(_modes(rate, states, point, episodes[0]))) for point in points)
     longest = longest_step(episodes)
     turn = fastest * longest
     return longest if turn <= 2.0 * _RESOLVED else longest / min(turn, _FINEST)
@@ -318,7 +316,11 @@ def _start(rate: Rate, states: Coordinates, measured: Sequence[int], episode: Ep
 
 def _memory(rate: Rate, states: Coordinates, x: Array, episode: Episode) -> float:
     """Return the slowest time constant at a state (n_x,), at most the time of the episode."""
-    u = np.repeat(episode.u[:1], len(states), axis=0)
-    slowest = np.min(np.abs(np.linalg.eigvals(differences(lambda y: rate(y, u), x, states.scale))))
     duration = float(episode.time[-1] - episode.time[0])
-    return 1.0 / max(float(slowest), 1.0 / duration)
+    return 1.0 / max(float(np.min(_modes(rate, states, x, episode))), 1.0 / duration)
+
+
+def _modes(rate: Rate, states: Coordinates, x: Array, episode: Episode) -> Array:
+    """Return the sizes (n_x,) of the eigenvalues at a state, under the episode's first input."""
+    u = np.repeat(episode.u[:1], len(states), axis=0)
+    return np.abs(np.linalg.eigvals(differences(lambda y: rate(y, u), x, states.scale)))
