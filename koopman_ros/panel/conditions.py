@@ -93,7 +93,7 @@ class Conditions:
         alike = [task for task in self.statuses
                  if (task.partition(':')[0] in ROLES) is (role is not None)]
         if not name or (name not in alike and len(alike) >= _MAX_TASKS and not (
-                level > OK and self._forget_one(alike))):
+                level > OK and self._forget_one(alike, now))):
             return
         if role in (CONTROLLER, TRAINER):
             self.take_message(role, now)
@@ -123,14 +123,21 @@ class Conditions:
                                f'{name}: {texts.get(key, "")}', now)
         self._keys[name] = tuple(texts)
 
-    def _forget_one(self, tasks: Sequence[str]) -> bool:
+    def _forget_one(self, tasks: Sequence[str], now: float) -> bool:
         """Make room for an alarm: forget a task without one; return whether there was any."""
         name = next((task for task in tasks if self.statuses[task].level == OK
                      and task not in self._errors), None)
         if name is None:
             return False
-        del self.statuses[name], self._since[name], self._keys[name]
+        self._forget(name, now)
         return True
+
+    def _forget(self, name: str, now: float) -> None:
+        """Forget a task, whose alarms return."""
+        status = self.statuses.pop(name)
+        del self._since[name]
+        for key in self._keys.pop(name):
+            self.alarms.report(key, False, Priority.LOW, status.message, now)
 
     def _is_alarm(self, status: TaskStatus, now: float) -> bool:
         """Return whether a warning or an error is an alarm, and no other alarm shows it."""
@@ -168,9 +175,7 @@ class Conditions:
         if now - self._simulated > _GONE:
             # perhaps a driver without statuses has replaced it
             for name in [task for task in self.statuses if task.startswith(f'{PLANT}: ')]:
-                status = self.statuses.pop(name)
-                for key in self._keys.pop(name):
-                    self.alarms.report(key, False, Priority.LOW, status.message, now)
+                self._forget(name, now)
         for name, errors in self._errors.items():
             often = len(errors) == _REPEATED and now - errors[0][0] <= _WITHIN
             self.alarms.report(
