@@ -188,6 +188,11 @@ class LiftedModel:
         return self.observables.identity
 
     @cached_property
+    def states_alone(self) -> bool:
+        """Whether its functions are the states alone, as in a linear model."""
+        return self.observables.features.n_z == self.n_x
+
+    @cached_property
     def kind(self) -> str:
         """Its class for people, of a lift with the number of coordinates."""
         lift, name = self.observables, self.provenance.model_class
@@ -486,9 +491,8 @@ class LiftedModel:
     @cached_property
     def _weights(self) -> Array | None:
         """Weights (n_x, n_phi) of the features in the drift; None if it is not linear in them."""
-        state_alone = self.identity and self.observables.features.n_z == self.n_x
-        return self.A - self.pre_feedback_slope if self.readout is None and state_alone else (
-            self.readout)
+        return self.A - self.pre_feedback_slope if self.readout is None and (
+            self.states_alone and self.identity) else self.readout
 
     def drift(self, x: Array) -> Array:
         """Evaluate f, the rate of the state without inputs: (..., n_x) -> same; f(0) = 0."""

@@ -145,7 +145,7 @@ def lifted_rate(model: LiftedModel, time_unit_seconds: float) -> Rate:
     has a rate everywhere: that of an unstable plant diverges from starts that are not fitted yet.
     """
     factor = time_unit_seconds / model.seconds_per_time_unit
-    limit = np.inf if model.observables.features.n_z == model.n_x else _DIVERGED
+    limit = np.inf if model.states_alone else _DIVERGED
 
     def rate(x: Array, u: Array) -> Array:
         xi = model.states.to_deviation(x)
