@@ -19,7 +19,7 @@ _LONGEST_STEP = 0.5
 _RESOLUTION = 1e-9
 # With inputs to spare the nearest solution is found when a step is no longer than this.
 _STILL = 1e-6
-_SLACK = 1e-6  # rounding error of an input, in scaled deviations
+_SLACK = 1e-6  # rounding error of an input or a state, in scaled deviations
 # Weight of the states against the inputs where the nearest steady state is wanted.
 _REACH = 1e3
 
@@ -100,7 +100,8 @@ def partial_target(model: LiftedModel, controlled: NDArray[np.intp], setpoint: A
         y = found.copy()
         y[n + worst] = min(max(y[n + worst], lower[worst]), upper[worst])
         found = equilibrium(model, w, y, free, anchor, reach)
-    if found is None or np.any((found[n:] < lower) | (found[n:] > upper)):
+    if found is None or np.any(
+            (found[n:] < lower - _RESOLUTION) | (found[n:] > upper + _RESOLUTION)):
         found = unlimited
     return None if found is None else _target(model, found, w)
 
@@ -132,7 +133,7 @@ def reachable_target(model: LiftedModel, controlled: NDArray[np.intp], target: T
         y[n + worst] = min(max(y[n + worst], lower[worst]), upper[worst])
         free[n + worst] = False
         found = equilibrium(model, w, y, free, anchor, reach)
-        if found is None or not np.all(np.abs(found[:n] - target.x) <= far):
+        if found is None or not np.all(np.abs(found[:n] - target.x) <= far + _SLACK):
             return None
         y = found
     return None

@@ -12,7 +12,7 @@ from scipy.optimize import lsq_linear
 
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, State, Tuning, Weights
 from koopman_ros.control.setpoint import advance, Setpoint
-from koopman_ros.control.steady_state import reachable_target
+from koopman_ros.control.steady_state import partial_target, reachable_target
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.estimation import Estimate
@@ -448,6 +448,20 @@ def test_where_a_pump_does_not_suffice_the_nearest_level_is_found(model, control
         estimate = Estimate(np.zeros(model.n_x), w)
         target = level.compute(np.array(asked), estimate, None, 1.0, None, None)[0]
         assert target.u == pytest.approx(found.u)
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_inputs_that_suffice_exactly_hold_the_setpoint(seed):
+    """Whichever way their sum is rounded."""
+    rng = np.random.default_rng(seed)
+    upper = rng.uniform(0.2, 1.0, 2)
+    # the first pump does more for each L/s, and would go beyond its range
+    gain = np.array([rng.uniform(2.0, 3.0), rng.uniform(0.2, 0.4)])
+    model = tanks([[-1.0]], [gain])
+    found = partial_target(
+        model, np.array([0]), np.array([model.B[0] @ upper]), np.zeros(1), -upper, upper,
+        np.zeros(3))
+    assert found.u == pytest.approx(upper, abs=1e-5)
 
 
 def test_of_more_states_than_inputs_behind_a_lag_the_target_is_a_compromise():
