@@ -149,7 +149,7 @@ class ControllerNode(ManagedNode):
         self._records = RecordPublisher(
             endpoints, lambda: records.snapshot(
                 self._loop.state, self._table.values(self._settings),
-                self._models.in_force.identity), self._loop.lock)
+                self._models.in_force.identity))
 
     def activate(self) -> None:
         """Begin to command, from the present inputs; earlier set-point requests are kept."""

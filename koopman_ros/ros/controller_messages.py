@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 import itertools
 import math
 import secrets
-import threading
 import time
 from typing import Any
 
@@ -168,26 +167,24 @@ class RecordPublisher:
     """
 
     def __init__(self, endpoints: topics.EndpointMonitor,
-                 snapshot: Callable[[], Mapping[str, Any]], lock: threading.Lock) -> None:
-        self._snapshot, self._lock = snapshot, lock
+                 snapshot: Callable[[], Mapping[str, Any]]) -> None:
+        self._snapshot = snapshot
         self._run, self._number, self._due = secrets.token_hex(8), 0, 0.0
-        self._started = False
-        self._publisher = endpoints.publish(topics.EVENT_LOG, matched=self._on_matched)
+        self._started, self._subscribers = False, 0
+        self._publisher = endpoints.publish(topics.EVENT_LOG)
 
     def start(self) -> None:
         """Publish the state from which the controller begins to act."""
         self._started = True
         self.publish_snapshot(START)
 
-    def _on_matched(self, info: Any) -> None:
-        if info.current_count_change > 0:
-            with self._lock:
-                self.publish_snapshot()
-                self._due = time.monotonic() + _AGAIN
-
     def watch(self) -> None:
-        """Publish a snapshot if one is due and there is a subscriber."""
-        if time.monotonic() > self._due and topics.has_subscribers(self._publisher):
+        """Publish a snapshot if there is a new subscriber, or any and one is due."""
+        before, self._subscribers = self._subscribers, self._publisher.get_subscription_count()
+        if self._subscribers > before:
+            self.publish_snapshot()
+            self._due = time.monotonic() + _AGAIN
+        elif self._subscribers and time.monotonic() > self._due:
             self.publish_snapshot()
 
     def publish_snapshot(self, event: str = SNAPSHOT) -> None:

@@ -13,8 +13,10 @@ import inspect
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
@@ -48,6 +50,24 @@ class HostedNode(Node):
         super().__init__(name, **options)
         if hosting is not None:
             hosting.made.append(self)
+
+    def create_publisher(self, *args: Any, **options: Any) -> Publisher:
+        """Create a publisher as any node does, but without events of the middleware."""
+        # rclpy raises or crashes where an entity is destroyed while one of its events is waiting
+        return super().create_publisher(
+            *args, event_callbacks=PublisherEventCallbacks(use_default_callbacks=False), **options)
+
+    def create_subscription(self, msg_type: Any, topic: str, callback: Callable[..., Any],
+                            *args: Any, **options: Any) -> Subscription:
+        """Subscribe as any node does, but without events of the middleware."""
+        return super().create_subscription(
+            msg_type, topic, self.guarded(callback), *args,
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False), **options)
+
+    def create_timer(self, period: float, callback: Callable[..., Any], *args: Any,
+                     **options: Any) -> Timer:
+        """Create a timer as any node does."""
+        return super().create_timer(period, self.guarded(callback), *args, **options)
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any],
                        **options: Any) -> Service:
@@ -116,4 +136,4 @@ class HostedNode(Node):
 def wall_timer(node: HostedNode, seconds: float, callback: Callable[[], Any], **options: Any
                ) -> Timer:
     """Create a timer by the steady clock, which runs while simulated time is paused."""
-    return node.create_timer(seconds, node.guarded(callback), clock=node.steady_clock, **options)
+    return node.create_timer(seconds, callback, clock=node.steady_clock, **options)

@@ -58,7 +58,7 @@ class Measurements:
         if not self.assembler.names:
             self._ticked_ns = -1
             self._shortest_ns = round(0.5 * settings.sample_time * NANOSECONDS)
-            node.create_timer(settings.sample_time, node.guarded(self._on_sample_time))
+            node.create_timer(settings.sample_time, self._on_sample_time)
         self.applied = MeasuredInputs(signals.inputs)
         self.disturbances = MeasuredInputs(signals.disturbances)
         self.frame_id, self._frame_length = '', 0

@@ -82,8 +82,7 @@ class LoopNode(HostedNode):
 
         # rclpy subscribes through here for `use_sim_time`, and a negative time ends it in spin
         return super().create_subscription(
-            msg_type, topic, self.guarded(on_clock if msg_type is ClockMessage else callback),
-            *args, **options)
+            msg_type, topic, on_clock if msg_type is ClockMessage else callback, *args, **options)
 
     def declare_parameters(self, namespace: str, parameters: list[Any],
                            ignore_override: bool = False) -> list[Parameter]:

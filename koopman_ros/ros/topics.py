@@ -14,7 +14,6 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy import qos as rclpy_qos
 from rclpy.duration import Infinite
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -152,19 +151,14 @@ class EndpointMonitor:
         # overriding parameters change the profile itself
         made = self._node.create_subscription(
             kind or TYPES[topic], topic, callback, copy.copy(qos),
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             qos_overriding_options=overridable())
         self._own.append(made)
         return made
 
-    def publish(self, topic: str, kind: Any = None, qos: QoSProfile = LOOP_QOS,
-                matched: Callable[[Any], None] | None = None) -> Publisher:
-        """Publish a topic, by default of its type in `TYPES`; matched is an event of rclpy."""
+    def publish(self, topic: str, kind: Any = None, qos: QoSProfile = LOOP_QOS) -> Publisher:
+        """Publish a topic, by default of its type in `TYPES`."""
         made = self._node.create_publisher(
-            kind or TYPES[topic], topic, copy.copy(qos),
-            event_callbacks=PublisherEventCallbacks(
-                matched=matched, use_default_callbacks=False),
-            qos_overriding_options=overridable())
+            kind or TYPES[topic], topic, copy.copy(qos), qos_overriding_options=overridable())
         self._own.append(made)
         return made
 

@@ -6,11 +6,15 @@
 from collections.abc import Sequence
 from pathlib import Path
 import shutil
+import signal
 import sys
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 import pytest
 from sensor_msgs.msg import Temperature
+from std_msgs.msg import String
 
 from koopman_ros.core.paths import model_path
 from koopman_ros.demo import reactor
@@ -162,6 +166,53 @@ def test_loops_of_a_process(ros: Harness, tmp_path: Path) -> None:
     # who was shut down has not failed
     ros.wait_for_status('controller_host: loops', lambda s: (
         value(s, 'running'), value(s, 'failed')) == ('1', '3'))
+    assert process.stop() == 0
+
+
+def test_a_clean_up_while_a_recorder_comes_ends_no_loop(ros: Harness) -> None:
+    """Both wait for the process, as they do for a busy one."""
+    process = start(ros, 'controller', ('a', 'b'))
+    loop = Loop(ros, '/b')
+    client = ros.node.create_client(ChangeState, '/a/controller/change_state')
+    ros.wait_until(client.service_is_ready)
+    for _ in range(4):
+        ros.meet('/a/controller')
+        assert change(ros, '/a/controller', 'deactivate')
+        process.process.send_signal(signal.SIGSTOP)
+        asked = client.call_async(ChangeState.Request(transition=Transition(label='cleanup')))
+        recorder = ros.node.create_subscription(String, '/a/event_log', lambda _: None, 10)
+        process.process.send_signal(signal.SIGCONT)
+        ros.wait_until(asked.done)
+        assert asked.result().success
+        loop.measure_and_wait()
+        ros.node.destroy_subscription(recorder)
+        assert change(ros, '/a/controller', 'configure')
+        assert change(ros, '/a/controller', 'activate')
+    assert process.stop() == 0
+    assert 'Traceback' not in process.output()
+
+
+# A node with a callback of rclpy's own, which nothing guards.
+UNGUARDED = """
+import sys
+from rclpy.node import Node
+from koopman_ros.nodes import controller
+class Own(controller.ControllerNode):
+    def configure(self):
+        super().configure()
+        if self.get_namespace() == '/a':
+            Node.create_timer(self, 0.05, lambda: 1 / 0)
+controller.ControllerNode = Own
+sys.exit(controller.main())
+"""
+
+
+def test_what_rclpy_raises_ends_no_loop(ros: Harness) -> None:
+    process = start(ros, 'controller', ('a', 'b'), command=(sys.executable, '-c', UNGUARDED))
+    loop = Loop(ros, '/b')
+    ros.wait_until(lambda: 'ZeroDivisionError' in process.output())
+    for _ in range(3):
+        loop.measure_and_wait()
     assert process.stop() == 0
 
 
