@@ -412,8 +412,9 @@ def _check_command(command: list[str], folder: Path) -> None:
             topics.message_class(kind)(**yaml.safe_load(message))
         case ['koopman_ros', 'pub', topic, message]:
             topics.message_class(_topics()[topic.removeprefix('/')])(**yaml.safe_load(message))
-        case ['ros2', 'topic', 'echo', topic] | ['koopman_ros', 'echo', topic, '--count', _]:
-            assert topic.removeprefix('/') in _topics(), topic
+        case ['ros2', 'topic', 'echo', topic] | ['ros2', 'topic', 'echo', '--once', topic, *_] | [
+                'koopman_ros', 'echo', topic, '--count', _]:
+            assert topic in topics.TYPES or topic.removeprefix('/') in _topics(), topic
         case ['ros2', 'service', 'call', service, kind, *request]:
             assert _services()[service] == kind, service
             topics.message_class(kind).Request(**yaml.safe_load(*request or ['{}']))

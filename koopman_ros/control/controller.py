@@ -14,7 +14,6 @@ import numpy as np
 from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.bumpless import with_step
 from koopman_ros.control.fallback import FallbackLevel
-from koopman_ros.control.feasibility import Feasibility
 from koopman_ros.control.recovery import rest_under, RestState
 from koopman_ros.control.state import Mode, State
 from koopman_ros.control.step import ControlStep
@@ -51,8 +50,9 @@ class Controller(ControlStep):
         """
         Request a set-point, at once or from a later time on.
 
-        It has to lie in the trained range, and an input within its range has to hold it under the
-        disturbance that is estimated now.
+        It has to lie in the trained range, and an input within its range has to hold it,
+        together with the other requests, under the disturbance that is estimated now. A signal
+        without a request stays where it is, or as near to it as the requested ones allow.
 
         :param value: (n,) of the signals, in state units.
         :param effective_ns: stamp from which it holds; see :func:`setpoint.request`.
@@ -80,27 +80,17 @@ class Controller(ControlStep):
         whole[[every.names.index(name) for name in asked]] = value
         requested = setpoints.request(state.setpoint, read_only(whole), effective_ns,
                                       state.time_ns)
-        rejection = self._infeasibility(state, setpoints.at_its_time(
-            requested, effective_ns, state.time_ns), len(asked) == len(every))
-        if rejection is not None:
-            return state, rejection
-        return state._replace(setpoint=requested), None
-
-    def _infeasibility(self, state: State, goal: Array, whole: bool) -> Reason | None:
-        """Return why a set-point (n_c,) cannot be held as things are, or None."""
-        level = self.best
+        goal = setpoints.at_its_time(requested, effective_ns, state.time_ns)
         try:
             with np.errstate(all='ignore'):
-                acting, w = self.estimation.level(state.supervisor), np.zeros(self.model.n_x)
-                # where a law acts that needs no model, none is trusted
-                if state.estimate is not None and not acting.law.model_free:
-                    w = self.estimation.transfer_estimate(state.estimate, acting, level).under(
-                        self.estimation.feed_forward(state)).w
-                feasible = Feasibility(level, self.order.margins[0], w, state.target)
-                return feasible.infeasibility(
-                    goal, (state.setpoint.requested, state.setpoint.active), state.command, whole)
+                rejection = self._feasibility(state).infeasibility(
+                    goal, (state.setpoint.requested, state.setpoint.active), state.command,
+                    len(asked) == len(every))
+                if rejection is None:
+                    return state._replace(setpoint=self._with_room(state, requested)), None
         except BaseException as error:
-            return reason(StatusCode.SETPOINT_NOT_TRIED, error=contained(error))
+            rejection = reason(StatusCode.SETPOINT_NOT_TRIED, error=contained(error))
+        return state, rejection
 
     def untrained(self, setpoint: setpoints.Setpoint) -> Reason | None:
         """Return the part of a requested set-point that is outside the trained range, or None."""

@@ -74,6 +74,24 @@ class Feasibility:
                       nearest=float(nearest[worst]),
                       held=tuple(zip(self.box.names, nearest.tolist(), strict=True)))
 
+    def yielding(self, goal: Array, asked: Array) -> Array:
+        """
+        Return a set-point (n_c,) that can be held, in state units; the goal where none is found.
+
+        :param goal: (n_c,) that may not be held.
+        :param asked: (n_c,) which of its signals stay; the others go as near to it as they can.
+        """
+        if self._held(goal):
+            return goal
+        level = replace(self.level, controlled=tuple(
+            name for name, stays in zip(self.box.names, asked, strict=True) if stays))
+        target = replace(self, level=level)._target(goal[asked])
+        if target is None:
+            return goal
+        places = self.level.controlled_of(self.level.model.states.to_physical(target.x))
+        found = self._on_the_way(goal, (np.where(asked, goal, places),))
+        return goal if found is None else found
+
     def _target(self, setpoint: Array) -> Target | None:
         return self.level.target(setpoint, self.w, self.start)
 

@@ -24,7 +24,7 @@ MAX_AHEAD = 30  # set-points that a law looks ahead to
 class Setpoint:
     """The state of the set-point."""
 
-    #: (n_c,) where the operator wants to be, or None before the first request; NaN, before the
+    #: (n_c,) where the active set-point goes, or None before the first request; NaN, before the
     #: first measurement, for signals without a request
     requested: Array | None = None
     #: (n_c,) active set-point, on its ramp to the requested value; None at first
@@ -34,6 +34,8 @@ class Setpoint:
     scheduled: tuple[tuple[int, Array], ...] = ()
     #: (n_c,) where the ramp is, which the filter follows; None for where it is
     ramped: Array | None = None
+    #: (n_c,) which signals an operator has requested by now; empty before the first request
+    asked: tuple[bool, ...] = ()
 
 
 def rejection(box: Coordinates, value: Array) -> Reason | None:
@@ -57,7 +59,7 @@ def request(setpoint: Setpoint, value: Array, effective_ns: int, now_ns: int | N
         left = ((time_ns, np.where(np.isnan(value), later, np.nan))
                 for time_ns, later in setpoint.scheduled)
         return replace(
-            setpoint, requested=overlaid(setpoint.requested, value),
+            setpoint, requested=overlaid(setpoint.requested, value), asked=_asked(setpoint, value),
             scheduled=tuple(entry for entry in left if not np.isnan(entry[1]).all()))
     # the later request for the same time replaces the earlier one
     entries = dict(setpoint.scheduled)
@@ -73,9 +75,16 @@ def overlaid(earlier: Array | None, later: Array) -> Array:
     return np.where(left_open, earlier, later)
 
 
+def _asked(setpoint: Setpoint, value: Array) -> tuple[bool, ...]:
+    """Return which signals (n_c,) were requested, with those of a request (n_c,)."""
+    given = np.isfinite(value)
+    return tuple((given | setpoint.asked if setpoint.asked else given).tolist())
+
+
 def at_its_time(setpoint: Setpoint, effective_ns: int, now_ns: int | None) -> Array:
     """Return the set-point (n_c,) when a request takes effect; NaN for signals without one."""
-    goal = setpoint.requested
+    goal = None if setpoint.requested is None or not setpoint.asked else np.where(
+        setpoint.asked, setpoint.requested, np.nan)
     if lies_ahead(effective_ns, now_ns):
         for time_ns, value in setpoint.scheduled:
             if time_ns <= effective_ns:
@@ -136,10 +145,10 @@ def advance(setpoint: Setpoint, measured: Array, box: Coordinates, ramp: Array, 
     due = [entry for entry in setpoint.scheduled if not lies_ahead(entry[0], now_ns)]
     if due:
         kept = tuple(entry for entry in setpoint.scheduled if lies_ahead(entry[0], now_ns))
-        requested = setpoint.requested
         for _, value in due:
-            requested = overlaid(requested, value)
-        setpoint = replace(setpoint, requested=requested, scheduled=kept)
+            setpoint = replace(setpoint, requested=overlaid(setpoint.requested, value),
+                               asked=_asked(setpoint, value))
+        setpoint = replace(setpoint, scheduled=kept)
     active = setpoint.active
     if active is None:
         active = np.clip(measured, box.lower, box.upper)

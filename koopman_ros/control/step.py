@@ -10,7 +10,7 @@ check the measurement -> estimate -> set-point -> level -> law -> transfer -> li
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -21,6 +21,7 @@ from koopman_ros.control.bumpless import BumplessTransfer, limit, with_step
 from koopman_ros.control.configuration import Configuration
 from koopman_ros.control.estimates import UNCERTAIN
 from koopman_ros.control.fallback import FallbackLevel
+from koopman_ros.control.feasibility import Feasibility
 from koopman_ros.control.laws.base import LawResult, Target
 from koopman_ros.control.recovery import moves_toward_nominal, SafeStateRecovery
 from koopman_ros.control.state import (
@@ -175,7 +176,30 @@ class ControlStep(Configuration):
             state.setpoint, self.best.controlled_of(x), self.controlled,
             self.tuning.setpoint_ramp, time.now_ns, time.counted,
             self.tuning.setpoint_filter_time)
-        return state if setpoint is state.setpoint else state._replace(setpoint=setpoint)
+        if setpoint is state.setpoint:
+            return state
+        if setpoint.asked != state.setpoint.asked or state.setpoint.active is None:
+            # a request from before the first measurement, or whose time has come
+            setpoint = setpoints.advance(
+                self._with_room(state, setpoint), self.best.controlled_of(x), self.controlled,
+                self.tuning.setpoint_ramp, time.now_ns, 0.0, self.tuning.setpoint_filter_time)
+        return state._replace(setpoint=setpoint)
+
+    def _with_room(self, state: State, setpoint: setpoints.Setpoint) -> setpoints.Setpoint:
+        """Move signals without a request to where the requested ones can be held."""
+        goal, asked = setpoint.requested, np.array(setpoint.asked)
+        if goal is None or asked.all() or not (asked.any() and np.isfinite(goal).all()):
+            return setpoint
+        return replace(setpoint, requested=self._feasibility(state).yielding(goal, asked))
+
+    def _feasibility(self, state: State) -> Feasibility:
+        """Return the feasibility of set-points as things are."""
+        acting, w = self.estimation.level(state.supervisor), np.zeros(self.model.n_x)
+        # where a law acts that needs no model, none is trusted
+        if state.estimate is not None and not acting.law.model_free:
+            w = self.estimation.transfer_estimate(state.estimate, acting, self.best).under(
+                self.estimation.feed_forward(state)).w
+        return Feasibility(self.best, self.order.margins[0], w, state.target)
 
     def _command(self, state: State, verdict: Verdict, measured: MeasurementReport,
                  time: StepTime) -> tuple[State, Array, StepReport]:

@@ -87,7 +87,7 @@ def player_table(given: Mapping[str, Any] = MappingProxyType({})
         defaults |= {
             'topics': tuple(dict.fromkeys(place.topic for places in (
                 wiring.applied, wiring.measured_disturbances, wiring.quality, wiring.measured,
-                wiring.setpoints, wiring.manual)
+                wiring.setpoints, wiring.joint_setpoints, wiring.manual)
                 for place in places.values())),
             'measurement': tuple(dict.fromkeys(
                 place.topic for place in wiring.measured.values())),

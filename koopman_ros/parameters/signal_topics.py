@@ -16,10 +16,23 @@ from typing import Any
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.declaration import parameter
-from koopman_ros.core.message_fields import base_name, MessageField, place, SIGNAL_NAME
+from koopman_ros.core.message_fields import (
+    base_name,
+    JOINT_STATE,
+    MessageField,
+    place,
+    SIGNAL_NAME,
+)
 from koopman_ros.core.paths import config_directory
 from koopman_ros.core.status import StatusFormatter
-from koopman_ros.core.units import check_unit, conversion, Display, Displays, shown
+from koopman_ros.core.units import (
+    check_unit,
+    conversion,
+    Display,
+    display_unit,
+    Displays,
+    shown,
+)
 from koopman_ros.model import Coordinates, LiftedModel
 from koopman_ros.parameters.table import ConfigurationError
 
@@ -29,6 +42,7 @@ PREDICTED_TRAJECTORY = 'predicted_trajectory'
 ACTIVE_CONSTRAINTS = 'active_constraints'
 AUDIT_LOG = 'audit_log'
 DIAGNOSTICS = '/diagnostics'
+SETPOINTS = 'setpoints'  # of several signals in one message
 CLOCK = '/clock'
 
 #: the default system
@@ -39,8 +53,8 @@ QUALITY = '1'  #: unit of a quality
 LONGEST_FRAME_ID = 256  # characters that are passed on
 
 # The places of signals: of states, then of inputs and of disturbances.
-KINDS = ('measured', 'quality', 'late', 'setpoints', 'active_setpoints', 'predicted', 'applied',
-         'commands', 'manual', 'measured_disturbances')
+KINDS = ('measured', 'quality', 'late', 'setpoints', 'joint_setpoints', 'active_setpoints',
+         'predicted', 'applied', 'commands', 'manual', 'measured_disturbances')
 PLANT_KINDS = ('measured', 'applied', 'commands', 'measured_disturbances')
 # parameters that name them
 SIGNALS = ('states_measured', 'inputs_commanded', 'disturbances_measured', 'controlled')
@@ -257,6 +271,14 @@ class SignalTopics:
     manual = _role('inputs', 'manual_topic', commanded=True)
     applied = _role('inputs', 'topic')
     measured_disturbances = _role('disturbances', 'topic')
+
+    @cached_property
+    def joint_setpoints(self) -> dict[str, MessageField]:
+        """Requested set-points in one message of named values, where there are several."""
+        units = {name: self.signals.states[name] for name in self.signals.controlled}
+        return {name: _place(SETPOINTS, name, unit, {
+            'type': JOINT_STATE, 'field': f'position[{name}]', 'unit': display_unit(unit)})
+            for name, unit in units.items()} if len(units) > 1 else {}
 
     @cached_property
     def quality(self) -> dict[str, MessageField]:

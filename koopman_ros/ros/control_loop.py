@@ -4,6 +4,7 @@
 """The state of a running controller, and the commands that follow from events and silences."""
 
 from collections.abc import Callable
+from dataclasses import replace
 import math
 import threading
 from typing import NamedTuple
@@ -16,7 +17,6 @@ from koopman_ros.control import (
     HOLD,
     Mode,
     SAFE,
-    Setpoint,
     State,
     StepReport,
     Supervisor,
@@ -76,7 +76,7 @@ class ControlLoop:
         """
         previous = self.state.setpoint
         self.state = State(self.state.mode,
-                           Setpoint(previous.requested, scheduled=previous.scheduled),
+                           replace(previous, active=None, ramped=None),
                            applied=last.applied, supervisor=(
                                Supervisor.latched_before() if latched else Supervisor()))
         self.timing, self._held_for, self._settling, self.active = timing, None, False, True

@@ -120,11 +120,11 @@ class Host:
             node.complete()
 
     def _turn(self) -> None:
-        """Call one callback that is due, or wait for the next; what it raises ends no loop."""
+        """Call one callback that is due, or wait for the next; no exception ends a loop."""
         try:
             self.executor.spin_once(timeout_sec=LONGEST_WAIT)
         except Exception:
-            # those of a node's callbacks have ended that node: this is of rclpy itself
+            # the exception of a node's callback has ended that node; others are rclpy's own
             self._node.get_logger().error(traceback.format_exc(), throttle_duration_sec=1.0)
         while self._leaving:
             self._part(self._leaving.pop())

@@ -64,10 +64,10 @@ class HostedNode(Node):
             msg_type, topic, self.guarded(callback), *args,
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False), **options)
 
-    def create_timer(self, period: float, callback: Callable[..., Any], *args: Any,
+    def create_timer(self, timer_period_sec: float, callback: Callable[..., Any], *args: Any,
                      **options: Any) -> Timer:
-        """Create a timer as any node does."""
-        return super().create_timer(period, self.guarded(callback), *args, **options)
+        """Create a timer as any node does, with errors of its own."""
+        return super().create_timer(timer_period_sec, self.guarded(callback), *args, **options)
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any],
                        **options: Any) -> Service:

@@ -139,7 +139,7 @@ def programs(given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Progr
                        topics.ACTIVE_CONSTRAINTS, topics.EVENT_LOG, topics.DIAGNOSTICS,
                        _TRANSITIONS, *STANDARD_TOPICS),
             subscribes=(*topics_of('measured', 'quality', 'applied', 'measured_disturbances',
-                                   'setpoints', 'manual'), topics.CLOCK),
+                                   'setpoints', 'joint_setpoints', 'manual'), topics.CLOCK),
             serves=('~/set_automatic', '~/clear_safe_state', '~/reload_model', *lifecycle,
                     *STANDARD_SERVICES),
             hosts=True),
@@ -158,7 +158,7 @@ def programs(given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Progr
             '0 if all messages were played or after a signal, 1 if it cannot start or continue, 2 '
             'for an unknown argument',
             publishes=(*topics_of('applied', 'measured_disturbances', 'measured', 'setpoints',
-                                  'manual'), topics.CLOCK,
+                                  'joint_setpoints', 'manual'), topics.CLOCK,
                        *STANDARD_TOPICS),
             subscribes=topics_of('commands'),
             serves=STANDARD_SERVICES),
@@ -191,7 +191,7 @@ def operator(given: Mapping[str, Any] = MappingProxyType({})) -> Program:
     """Return the access of a person or a panel: set-points, services, recording, all topics."""
     nodes = programs(given)
     wiring, _ = _wiring(given)
-    asks = (*wiring.setpoints.values(), *wiring.manual.values())
+    asks = (*wiring.setpoints.values(), *wiring.joint_setpoints.values(), *wiring.manual.values())
     return Program(
         publishes=(*(place.topic for place in asks), _BAG_RECORDER_TOPIC, *STANDARD_TOPICS),
         subscribes=(*nodes['trainer'].subscribes, _BAG_RECORDER_TOPIC, *STANDARD_TOPICS, *(

@@ -3,7 +3,7 @@
 
 """Requests to a controller: set-points, manual commands, the mode, and values of a laboratory."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import math
 import time
 
@@ -40,12 +40,11 @@ class OperatorRequests:
         self._note, self._noted = '', 0.0
         self.setpoint_received = False
         # volatile, so that `ros2 topic pub` matches
-        for name, place in wiring.setpoints.items():
-            SignalSubscriber(node, endpoints.subscribe, {name: place}, wiring.signals.states,
-                             self._on_setpoint)
-        for name, place in wiring.manual.items():
-            SignalSubscriber(node, endpoints.subscribe, {name: place}, wiring.signals.inputs,
-                             self._on_manual)
+        for places in (wiring.setpoints, wiring.joint_setpoints):
+            SignalSubscriber(node, endpoints.subscribe, places, wiring.signals.states,
+                             self._on_setpoints)
+        SignalSubscriber(node, endpoints.subscribe, wiring.manual, wiring.signals.inputs,
+                         self._on_manual)
         SignalSubscriber(node, endpoints.subscribe, wiring.late, wiring.signals.every,
                          self._on_analysis)
         node.create_service(SetBool, '~/set_automatic', self._on_set_automatic)
@@ -56,21 +55,32 @@ class OperatorRequests:
         """Why the last request was rejected or limited, for a minute; or an empty string."""
         return self._note if time.monotonic() - self._noted < _SHOWN else ''
 
-    def _on_setpoint(self, received: SignalSample) -> None:
-        (name, value), = received.values.items()
+    def _on_setpoints(self, received: SignalSample) -> None:
         # only a stamp of the sender schedules it
         stamp_ns = received.stamp_ns if received.stamped else 0
         several = len(self._signals.controlled) > 1
+        before = self._loop.state.setpoint.requested
         if self._change(events.SetpointRequest(
-                stamp_ns, np.array([value]), (name,) if several else None)):
+                stamp_ns, np.array([*received.values.values()]),
+                tuple(received.values) if several else None)):
             self.setpoint_received = True
-            scheduled = any(entry[0] == stamp_ns for entry in self._loop.state.setpoint.scheduled)
+            setpoint = self._loop.state.setpoint
+            scheduled = any(entry[0] == stamp_ns for entry in setpoint.scheduled)
             when = f', effective from {stamp_ns / NANOSECONDS:.3f} s' if scheduled else ''
-            unit = self._signals.states[name]
-            self._log.info(
-                f'set-point {quantity_text(value, unit)} of {name} accepted{when}',
-                throttle_duration_sec=1.0)
+            moved = {} if before is None or setpoint.requested is None else {
+                name: value for name, value, old in zip(
+                    self._signals.controlled, setpoint.requested.tolist(), before.tolist(),
+                    strict=True)
+                if name not in received.values and abs(value - old) > 0.0}
+            room = f'; {self._quantities(moved)} makes room, as it was not requested' * bool(moved)
+            self._log.info(f'set-point {self._quantities(received.values)} accepted{when}{room}',
+                           throttle_duration_sec=1.0)
         self._changed()
+
+    def _quantities(self, values: Mapping[str, float]) -> str:
+        """Write values of states, by name, with their units."""
+        return ', '.join(f'{quantity_text(value, self._signals.states[name])} of {name}'
+                         for name, value in values.items())
 
     def _on_analysis(self, received: SignalSample) -> None:
         for name, value in received.values.items():

@@ -236,8 +236,11 @@ def test_the_nearest_of_two_levels_is_that_of_least_squares():
     controller = loop(BOTH, upper=[3.5, 3.2])
     rejected = asked(controller, [1.0, 1.9])[1]
     assert dict(rejected.values['held']) == pytest.approx({'h1': 1.35, 'h2': 1.55}, abs=1e-5)
-    # one alone leaves the other where it is
+    # one alone moves the other as far as it needs, unless that was requested
     state = stepped(controller, State(), [1.0, 1.0], 0)[0]
+    rejected = asked(controller, 1.9, state, signals=('h2',))[1]
+    assert dict(rejected.values['held']) == pytest.approx({'h2': 1.7}, abs=1e-5)
+    state = asked(controller, 1.0, state, signals=('h1',))[0]
     rejected = asked(controller, 1.9, state, signals=('h2',))[1]
     assert dict(rejected.values['held']) == pytest.approx({'h1': 1.0, 'h2': 1.2}, abs=1e-5)
 
@@ -296,6 +299,39 @@ def test_schedules_are_kept_per_signal():
     assert tracked == [[0.8, 1.0], [0.8, 1.2], [0.8, 1.2], [0.8, 1.4], [0.8, 1.4], [0.8, 0.9],
                        [0.8, 0.9]]
     assert state.setpoint.scheduled == ()
+
+
+@pytest.mark.parametrize('early', [False, True])
+def test_a_signal_that_nobody_requested_makes_room(early):
+    # at rest h2 - 1 = (h1 - 1) + (q2 - 3) with h1 - 1 = q1 - 3: with q2 at 2.9 or more, h1 at 1.2
+    # leaves h2 no lower than 1.1
+    controller = loop(BOTH, 'h1', 'h2', lower=[0.0, 2.9])
+    state = State() if early else stepped(controller, State(), [1.0, 1.0], 0)[0]
+    state, rejected = asked(controller, 1.2, state, signals=('h1',))
+    assert rejected is None
+    state, _, report = stepped(controller, state, [1.0, 1.0], 1)
+    assert report.target.setpoint == pytest.approx([1.2, 1.1], abs=1e-5)
+    # which is no request: what is requested counts with what was requested
+    for value, allowed in ((1.15, True), (1.0, False)):
+        state, rejected = asked(controller, value, state, signals=('h2',))
+        assert (rejected is None) is allowed
+    state, _, report = stepped(controller, state, [1.0, 1.0], 2)
+    assert report.target.setpoint == pytest.approx([1.2, 1.15])
+    assert asked(controller, 1.3, state, signals=('h1',))[1] is not None
+    state, rejected = asked(controller, [1.1, 1.0], state)
+    assert rejected is None
+
+
+def test_a_signal_that_nobody_requested_makes_room_when_a_schedule_is_due():
+    controller = loop(BOTH, 'h1', 'h2', lower=[0.0, 2.9])
+    state = stepped(controller, State(), [1.0, 1.0], 0)[0]
+    state, rejected = asked(controller, 1.2, state, effective_ns=EPOCH + 2 * SECOND,
+                            signals=('h1',))
+    assert rejected is None
+    # the time of the other has not come, and it is requested at once
+    for second, expected in ((1, [1.0, 1.0]), (2, [1.2, 1.1])):
+        state, _, report = stepped(controller, state, [1.0, 1.0], second)
+        assert report.target.setpoint == pytest.approx(expected, abs=1e-5)
 
 
 def test_a_request_that_is_due_for_one_signal_leaves_the_ramp_of_the_other():
