@@ -43,10 +43,6 @@ $(VENV)/retrain.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,train]'
 	@touch $@
 
-$(VENV)/saddle.stamp: setup.py $(LOCK) $(VENV)/run.stamp
-	$(INSTALL) --editable '.[ros,demo,train,mpc]'
-	@touch $@
-
 $(VENV)/mpc.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,mpc]'
 	@touch $@
@@ -70,7 +66,7 @@ demo-retrain: $(VENV)/retrain.stamp  ## retrain the model of a plant that change
 	$(BIN)/python -m koopman_ros.demo retrain
 
 demo-saddle: SEEDS = 5
-demo-saddle: $(VENV)/saddle.stamp  ## train on an unstable reactor under PI control, temperature measured only, and stabilise it; SEEDS=5, 15 min -> out/demo-saddle
+demo-saddle: $(VENV)/bench.stamp  ## train on an unstable reactor under PI control, temperature measured only, and stabilise it; SEEDS=5, 15 min -> out/demo-saddle
 	$(BIN)/python -m studies.saddle_act --seeds $(SEEDS)
 
 # Types are checked in parallel with the tests. Tests with processes mostly wait, so there are two more
@@ -92,7 +88,7 @@ lint: $(VENV)/test.stamp  ## lint and type checks
 
 learn: $(VENV)/train.stamp  ## set up training from Python and the command line, without ROS
 
-models: $(VENV)/train.stamp  ## retrain the bundled models -> config/models
+models: $(VENV)/bench.stamp  ## retrain the bundled models -> config/models
 	$(BIN)/python -m studies.shipped_models
 
 studies: $(VENV)/train.stamp  ## experiments of the paper, SEEDS=20: figures and report -> out/studies
@@ -116,7 +112,7 @@ studies-unstable: $(VENV)/bench.stamp  ## training on an unstable reactor under 
 	$(BIN)/python -m studies.unstable --seeds $(SEEDS)
 
 studies-saddle: SEEDS = 10
-studies-saddle: $(VENV)/saddle.stamp  ## control of the unstable reactor, temperature measured only, SEEDS=10, 30 min
+studies-saddle: $(VENV)/bench.stamp  ## control of the unstable reactor, temperature measured only, SEEDS=10, 30 min
 	$(BIN)/python -m studies.saddle --seeds $(SEEDS)
 
 studies-export: $(VENV)/run.stamp  ## compare exported C code with the controller: bundled models and 50 random ones, 10,000 samples each, 1 h -> out/studies-export
