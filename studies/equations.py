@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import casadi
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.integration import runge_kutta_step
 from koopman_ros.plants.library.pendulum import Pendulum
 from koopman_ros.plants.library.quadruple_tank import QuadrupleTank
 from koopman_ros.plants.library.reactor import FedReactor, ReactorParameters, TwoStateReactor

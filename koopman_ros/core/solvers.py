@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Riccati equations of the continuous and the sampled regulator, Runge-Kutta steps, Jacobians."""
+"""Riccati equations of the continuous and the sampled regulator, Jacobians."""
 
 from collections.abc import Callable
 import math
@@ -13,7 +13,7 @@ from scipy.linalg.lapack import dgees, dgeev, dgesv
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.status import StatusCode
 
-__all__ = ['RiccatiSolution', 'differences', 'over_interval', 'runge_kutta_step', 'solve_riccati',
+__all__ = ['RiccatiSolution', 'differences', 'over_interval', 'solve_riccati',
            'spectral_radius']
 
 # A double eigenvalue of the Hamiltonian on the imaginary axis comes out split by about the square
@@ -236,12 +236,3 @@ def differences(function: Callable[[Array], Array], x: Array, scale: Array) -> A
     ahead, behind = (function(x[..., None, :] + sign * steps) for sign in (1.0, -1.0))
     columns = (ahead - behind) / (2.0 * _DIFFERENCE * scale[:, None])
     return np.asarray(columns.swapaxes(-1, -2), dtype=np.float64)
-
-
-def runge_kutta_step(rate: Callable[[Array], Array], x: Array, h: Array | float) -> Array:
-    """Step dx/dt = rate(x) by h, which broadcasts with x, by the Runge-Kutta method of order 4."""
-    k1 = rate(x)
-    k2 = rate(x + 0.5 * h * k1)
-    k3 = rate(x + 0.5 * h * k2)
-    k4 = rate(x + h * k3)
-    return x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)

@@ -16,6 +16,7 @@ import numpy as np
 
 from koopman_ros.core.arrays import all_finite, Array
 from koopman_ros.core.declaration import NoParameters
+from koopman_ros.core.integration import fastest_rate, integrate, STEPS
 from koopman_ros.core.signals import Outputs
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
@@ -113,6 +114,33 @@ def with_commands(model: LiftedModel, estimate: Estimate, u: Array) -> Estimate:
     """Return an estimate whose states that are commands are those inputs (n_u,) that act."""
     return estimate if not model.commanded else replace(
         estimate, x=with_applied(model, estimate.x, u, model.commanded))
+
+
+def predicted_state(model: LiftedModel, estimate: Estimate, u: Array, seconds: float
+                    ) -> Array | None:
+    """
+    Integrate the state (n_x,) of an estimate under input and disturbance.
+
+    :param u: (n_u,) applied input, in scaled deviations.
+    :return: None after so long that it takes too many steps.
+    """
+    duration, steps = integration_steps(model, estimate, u, seconds)
+    return None if steps is None else integrate(
+        model.rate_under(u, estimate.w), estimate.x, duration, steps)
+
+
+def integration_steps(model: LiftedModel, estimate: Estimate, u: Array, seconds: float
+                      ) -> tuple[float, int | None]:
+    """
+    Return an interval in time units and the steps that it takes, or None for too many.
+
+    The fastest mode is that at the estimate or at the nominal point, to which it may return.
+    """
+    duration = seconds / model.seconds_per_time_unit
+    local = fastest_rate(model.rate_and_slope(estimate.x, u)[1])
+    # a rate that is not a number must not be lost in a comparison
+    return duration, STEPS.count(duration, local if local > model.linearised.fastest_rate
+                                 or math.isnan(local) else model.linearised.fastest_rate)
 
 
 class Estimator(ABC):

@@ -10,26 +10,18 @@ import numpy as np
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.signals import Outputs
-from koopman_ros.estimation.base import Estimate, Estimator, LOST
+from koopman_ros.estimation.base import Estimate, Estimator, LOST, predicted_state
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
-# One step of integration spans at most this share of the model's fastest time constant.
-_STEP_SHARE = 0.1
-_MAX_STEPS = 20
 _CONVERGED = 1e-9  # of scaled deviations; the figure is shown with nine digits
 
 
 def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
-    """Integrate the model by Heun's method; None after too long, or where the estimate is lost."""
-    duration = seconds / model.seconds_per_time_unit
-    steps = max(1, math.ceil(duration * model.linearised.fastest_rate / _STEP_SHARE))
-    if steps > _MAX_STEPS:
+    """Integrate the model; None after too long, or where the estimate is lost."""
+    x = predicted_state(model, estimate, u, seconds)
+    if x is None:
         return None
-    x, h, rate = estimate.x, duration / steps, model.rate_under(u, estimate.w)
-    for _ in range(steps):
-        slope = rate(x)
-        x = x + (0.5 * h) * (slope + rate(x + h * slope))
     # far out the model's drift grows without bound, and corrections could not bring x back
     within = all(abs(one) <= LOST * half for one, half in zip(
         x.tolist(), model.states.half_widths.tolist(), strict=True))

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.core.arrays import Array
+from koopman_ros.core.integration import integrate, sensitivity_rate
 from koopman_ros.core.signals import Outputs
-from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.core.units import SECONDS_PER_MINUTE
 from koopman_ros.estimation.base import (
     effect_of_inputs,
@@ -21,7 +21,9 @@ from koopman_ros.estimation.base import (
     Estimator,
     Innovation,
     INNOVATION_WINDOW,
+    integration_steps,
     LOST,
+    predicted_state,
 )
 from koopman_ros.estimation.dead_time import largest_bandwidth
 from koopman_ros.model import LiftedModel
@@ -32,9 +34,6 @@ from koopman_ros.tuning import Tuning
 # estimate.
 _NOISE, _WANDER, _GUESS = 1e-3, 0.1, 0.5
 _LONGEST = 86400.0  # s, of time constants
-# One step of integration spans at most this share of the drift's fastest time constant.
-_STEP_SHARE = 0.5
-_MAX_STEPS = 40
 # A disturbance is at first as uncertain as after so many of the drift's slowest time constants,
 # but a day at most.
 _WANDERED, _A_DAY = 3.0, 86400.0
@@ -177,54 +176,38 @@ class ExtendedKalmanFilter(Estimator):
 
     def predict(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
         """Integrate the model, and the covariance with it; see :class:`Estimator`."""
-        h, steps = self._steps(seconds)
-        if steps > _MAX_STEPS:
-            return None
         n = self.model.n_x
+        duration, steps = integration_steps(self.model, estimate, u, seconds)
+        if steps is None:
+            return None
         P = (self.initial_covariance if estimate.covariance is None
              else estimate.covariance).copy()
         # the disturbance wanders first, and then stays for the interval
         P[n:, n:] += seconds * self._intensity
-        x, P = self._propagated(estimate.x, estimate.w, P, u, h, steps)
+        x, P = self._propagated(estimate.x, estimate.w, P, u, duration, steps)
         if not np.all(np.diag(P)[:n] <= self._lost):
             return None
         return replace(estimate, x=x, covariance=0.5 * (P + P.T))
 
     def predict_state(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
         """Integrate the model alone; None where the state is lost."""
-        h, steps = self._steps(seconds)
-        if steps > _MAX_STEPS:
-            return None
-        x, rate = estimate.x, self.model.rate_under(u, estimate.w)
-        for _ in range(steps):
-            x = runge_kutta_step(rate, x, h)
-        return replace(estimate, x=x, covariance=None) if np.all(x * x <= self._lost) else None
+        x = predicted_state(self.model, estimate, u, seconds)
+        return None if x is None or not np.all(x * x <= self._lost) else replace(
+            estimate, x=x, covariance=None)
 
-    def _steps(self, seconds: float) -> tuple[float, int]:
-        """Return the duration of a step of integration, in time units, and their number."""
-        duration = seconds / self.model.seconds_per_time_unit
-        steps = max(1, math.ceil(duration * float(np.max(self._rates)) / _STEP_SHARE))
-        return duration / steps, steps
-
-    def _propagated(self, x: Array, w: Array, P: Array, u: Array, h: float, steps: int
+    def _propagated(self, x: Array, w: Array, P: Array, u: Array, duration: float, steps: int
                     ) -> tuple[Array, Array]:
-        """Return state and covariance after a number of steps of h, in time units."""
-        model = self.model
-        n = model.n_x
-        forced = np.concatenate((np.zeros((n, n)), np.eye(n)), axis=1)
+        """Return state and covariance later, after a number of steps; in time units."""
+        n = self.model.n_x
+
+        def rate_and_slope(x: Array) -> tuple[Array, Array]:
+            rate, slope = self.model.rate_and_slope(x, u)
+            return rate + w, slope
+
         # x and its derivatives by the previous x and w
-        whole = np.concatenate((x[:, None], np.eye(n), np.zeros((n, n))), axis=1)
-
-        def rate(whole: Array) -> Array:
-            x = whole[:, 0]
-            f, J = model.drift_and_jacobian(x)
-            if model.input_terms is not None:
-                J = J + model.forcing_jacobian(x, u)
-            return np.concatenate(((f + model.forcing(x, u) + w)[:, None],
-                                   J @ whole[:, 1:] + forced), axis=1)
-
-        for _ in range(steps):
-            whole = runge_kutta_step(rate, whole, h)
+        whole = integrate(
+            sensitivity_rate(rate_and_slope, np.eye(n, 2 * n, n)),
+            np.concatenate((x[:, None], np.eye(n, 2 * n)), axis=1), duration, steps)
         F = np.eye(2 * n)
         F[:n] = whole[:, 1:]
         return whole[:, 0].copy(), F @ P @ F.T
@@ -290,9 +273,9 @@ class UnscentedKalmanFilter(ExtendedKalmanFilter):
     state, the correction is the same.
     """
 
-    def _propagated(self, x: Array, w: Array, P: Array, u: Array, h: float, steps: int
+    def _propagated(self, x: Array, w: Array, P: Array, u: Array, duration: float, steps: int
                     ) -> tuple[Array, Array]:
-        """Return mean and covariance of points after a number of steps of h."""
+        """Return mean and covariance of points later, after a number of steps; in time units."""
         model, n = self.model, self.model.n_x
         values, vectors = np.linalg.eigh(P)
         size = int(np.count_nonzero(values > _NO_VARIANCE * values[-1]))
@@ -302,9 +285,7 @@ class UnscentedKalmanFilter(ExtendedKalmanFilter):
             (np.zeros((1, 2 * n)), root.T, -root.T))
         weights = np.full(len(points), 0.5 / (size + kappa))
         weights[0] = kappa / (size + kappa)
-        rate, moved = model.rate_under(u, points[:, n:]), points[:, :n]
-        for _ in range(steps):
-            moved = runge_kutta_step(rate, moved, h)
+        moved = integrate(model.rate_under(u, points[:, n:]), points[:, :n], duration, steps)
         points = np.concatenate((moved, points[:, n:]), axis=1)
         mean = weights @ points
         deviation = points - mean

@@ -20,12 +20,9 @@ from koopman_ros.control.fallback import FallbackLevel
 from koopman_ros.control.laws import Law, Linear, Weights
 from koopman_ros.control.laws.base import steady_state_target
 from koopman_ros.core.arrays import Array
+from koopman_ros.core.integration import integrate
 from koopman_ros.core.signals import Outputs
-from koopman_ros.core.solvers import (
-    differences,
-    runge_kutta_step,
-    solve_riccati,
-)
+from koopman_ros.core.solvers import differences, solve_riccati
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import AppliedInputs, Estimate, MeasuredState, PendingInputs
 from koopman_ros.execution import Notify
@@ -326,9 +323,7 @@ def _run(given: LoopBatch, feedbacks: Sequence[_Feedback], cases: tuple[Array, A
                     else:
                         v[k][:, now] = act(y[k, :, :n] + noise, active[k])[:, now]
                 steps = math.ceil(given.steps * length / given.interval)
-                ahead = y
-                for _ in range(steps):
-                    ahead = runge_kutta_step(lambda y: flow(y, v), ahead, length / steps)
+                ahead = integrate(lambda y: flow(y, v), y, length, steps)
                 y = np.where(active[..., None], ahead, y)
         at_target = arrived()
     return np.where(at_target & np.isfinite(y[..., n]), y[..., n], np.inf), no_gain

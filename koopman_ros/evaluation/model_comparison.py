@@ -146,11 +146,9 @@ class PredictionWindows:
         x, eye = model.states.to_deviation(self.x), np.eye(n)
         h = (self.steps / model.seconds_per_time_unit)[:, None]
         try:
-            f, F, half = model.drift(x), model.drift_jacobian(x), 0.5 * h[..., None]
-            u = model.inputs.to_deviation(self.u)
-            (f0, F0), (f1, F1) = (
-                (f[rows] + model.forcing(x[rows], u), F[rows] + model.forcing_jacobian(x[rows], u))
-                for rows in (slice(-1), slice(1, None)))
+            u, half = model.inputs.to_deviation(self.u), 0.5 * h[..., None]
+            (f0, F0), (f1, F1) = (model.rate_and_slope(x[rows], u)
+                                  for rows in (slice(-1), slice(1, None)))
             # the trapezoidal rule for the error e: e' = F e + w + (f + B(x) u - dx/dt)
             lack = h * (0.5 * (f0 + f1))
             right = np.concatenate([(lack - np.diff(x, axis=0))[..., None], np.broadcast_to(

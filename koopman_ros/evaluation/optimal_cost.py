@@ -11,7 +11,8 @@ import math
 import numpy as np
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.solvers import runge_kutta_step, solve_riccati
+from koopman_ros.core.integration import integrate
+from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.plants.system import ControlAffineSystem
 
 _MAX_ITERATIONS = 200
@@ -133,9 +134,7 @@ def _after_a_period(task: Task, y: Array, u: Array) -> Array:
         found[..., -1] = (x - task.x_ref) ** 2 @ task.Q + effort
         return found
 
-    for _ in range(task.substeps):
-        y = runge_kutta_step(rate, y, task.period / task.substeps)
-    return y
+    return integrate(rate, y, task.period, task.substeps)
 
 
 def _improvement(task: Task, trajectory: OptimalTrajectory) -> tuple[Array, Array, float]:
@@ -182,7 +181,6 @@ def _expansion(task: Task, trajectory: OptimalTrajectory) -> tuple[Array, Array,
     y = np.zeros((N, ends[-1]))
     y[:, :n] = trajectory.states[:-1]
     y[:, n:ends[1]] = np.eye(n, p).ravel()
-    for _ in range(task.substeps):
-        y = runge_kutta_step(rate, y, task.period / task.substeps)
+    y = integrate(rate, y, task.period, task.substeps)
     return (y[:, ends[0]:ends[1]].reshape(N, n, p), y[:, ends[1]:ends[2]],
             y[:, ends[2]:].reshape(N, p, p))

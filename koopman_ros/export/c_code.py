@@ -23,6 +23,7 @@ import numpy as np
 from koopman_ros import __version__
 from koopman_ros.control import Controller
 from koopman_ros.control.laws.riccati import closed
+from koopman_ros.core.integration import STEPS
 from koopman_ros.core.status import StatusCode
 from koopman_ros.estimation import DisturbanceObserver, ExtendedKalmanFilter, MeasuredState
 from koopman_ros.model import NetworkObservables, PolynomialObservables
@@ -177,7 +178,6 @@ def _tables(controller: Controller, interval: float) -> dict[str, Any]:
     curves = [model.inputs.characteristics.get(name) for name in model.inputs.names]
     linear, unit, none = model.linearised, model.seconds_per_time_unit, np.zeros(0)
     order = model.n_z if closed(model) else n
-    fastest = np.max(np.abs(np.linalg.eigvals(linear.A))) if kalman else linear.fastest_rate
     dead = [round(seconds * 1e9) for seconds in tuning.dead_times(model).tolist()]
     return {
         'NX': n, 'NU': m, 'NY': n_y, 'NC': len(controller.controlled), 'NZ': model.n_z,
@@ -190,11 +190,7 @@ def _tables(controller: Controller, interval: float) -> dict[str, Any]:
         'KALMAN': kalman, 'DETERMINED': outputs.determine_state, 'CONTROLS_ALL': best.controls_all,
         'RESTS': np.count_nonzero(np.any(outputs.C != 0.0, axis=0)) == n_y, 'TIME_UNIT': unit,
         'FASTEST_RATE': linear.fastest_rate / unit,
-        # of an estimator: steps a time constant and at most, and those of its integration
-        'STEP_RATE': (2.0 if kalman else 10.0) * fastest / unit,
-        'MOST_STEPS': 40.0 if kalman else 20.0, 'STAGES': 4 if kalman else 2,
-        'AHEAD': (0.0, 0.5, 0.5, 1.0) if kalman else (0.0, 1.0),
-        'PARTS': (1.0, 2.0, 2.0, 1.0) if kalman else (3.0, 3.0),
+        'STEP_LENGTH': STEPS.time_constants, 'STEP_MOST': float(STEPS.most),
         # one that measures the state takes all of a measurement, and knows no disturbance
         'OBSERVER_BANDWIDTH': tuning.observer_bandwidth if estimator.remembers else math.inf,
         'MAX_DISTURBANCE': np.where(

@@ -13,13 +13,11 @@ from koopman_ros.control import Controller
 from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.state import State, StepReport
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.integration import integrate, STEPS
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.export.c_code import CODES
 
-# Largest integration step of the simulated plant, as a share of the fastest time constant.
-_STEP = 0.2
 # Faults, or none, that last longer than others.
 _LONG = ('', 'silent', 'stuck', 'pushed', 'lost')
 
@@ -150,9 +148,7 @@ def _moved(controller: Controller, x: Array, u: Array, w: Array, seconds: float)
     """Return the state of the model later; at rest at the nominal point where it diverges."""
     model = controller.model
     duration = seconds / model.seconds_per_time_unit
-    steps = min(20, max(1, math.ceil(duration * model.linearised.fastest_rate / _STEP)))
-    rate = model.rate_under(u, w)
+    steps = STEPS.count(duration, model.linearised.fastest_rate) or STEPS.most
     with np.errstate(all='ignore'):
-        for _ in range(steps):
-            x = runge_kutta_step(rate, x, duration / steps)
+        x = integrate(model.rate_under(u, w), x, duration, steps)
     return x if np.all(np.abs(x) < 5.0 * model.states.half_widths) else np.zeros(model.n_x)

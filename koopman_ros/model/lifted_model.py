@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import Array, frozen, short_repr, show_printed
 from koopman_ros.core.datasets import PlantDescription
+from koopman_ros.core.integration import adaptive
 from koopman_ros.core.units import (
     check_time_unit,
     display_unit,
@@ -47,8 +48,8 @@ _FIGURES = {'cond': 'Condition number', 'rw': 'Held-out residual of the lift, re
 _FIGURES_OF_STATES = {'rollout_rmse': 'Held-out roll-out error (RMS)',
                       'noise': 'Measurement noise', 'free_run': 'Free-run error (RMS)'}
 _SAMPLES = 256  # random states of a box whose training states are not known
-# Of the drift in a prediction, for each sample; a model a thousand times faster needs a fifth.
-_MAX_DRIFTS = 10_000
+# Of a prediction, for each sample; a model a thousand times faster needs a fifth.
+_MAX_STEPS = 1000
 # A prediction this far from the nominal point, in units of the scale, has diverged.
 _DIVERGED = 1e6
 # Of Gauss and Legendre on [0, 1].
@@ -311,9 +312,6 @@ class LiftedModel:
         :raises RuntimeError: when the prediction diverges.
         :raises ValueError: for arrays that do not fit the model, or periods that are not above 0.
         """
-        # not needed by nodes, which it would cost a tenth of a second at their start
-        from scipy.integrate import DOP853
-
         inputs = self.inputs.array('inputs', inputs)
         xi = self.states.to_deviation(self.states.array('x0', x0))
         shape = xi.shape
@@ -331,14 +329,15 @@ class LiftedModel:
             # a prediction that overflows is reported below
             with np.errstate(all='ignore'):
                 rate = self.rate_under(v[..., k, :])
-                solver = DOP853(
-                    lambda _, y, rate=rate: rate(y.reshape(shape)).ravel(), 0.0, xi.ravel(),
-                    period, rtol=1e-9, atol=1e-12)
+
+                def flat(_: float, y: Array, rate: Callable[[Array], Array] = rate) -> Array:
+                    return rate(y.reshape(shape)).ravel()
+
                 # near a state where J_N is singular the steps may become ever shorter
-                while solver.status == 'running' and solver.nfev < _MAX_DRIFTS:
-                    solver.step()
-            xi = solver.y.reshape(shape)
-            if solver.status != 'finished' or not np.all(np.abs(xi) < _DIVERGED):
+                end, arrived = adaptive(flat, xi.ravel(), period, rtol=1e-9, atol=1e-12,
+                                        most=_MAX_STEPS)
+            xi = end.y.reshape(shape)
+            if not (arrived and np.all(np.abs(xi) < _DIVERGED)):
                 raise RuntimeError(f'the prediction diverged after {len(path)} samples: keep the '
                                    'inputs within the trained range')
             path.append(xi)
@@ -418,6 +417,11 @@ class LiftedModel:
         if self.input_terms is None:
             return np.zeros((self.n_x, self.n_x))
         return self.input_terms.jacobian(x, u)
+
+    def rate_and_slope(self, x: Array, u: Array) -> tuple[Array, Array]:
+        """Evaluate f(x) + B(x) u (..., n_x) and its derivative by x (..., n_x, n_x)."""
+        f, J = self.drift_and_jacobian(x)
+        return f + self.forcing(x, u), J + self.forcing_jacobian(x, u)
 
     def rate_under(self, u: Array, w: Array | float = 0.0) -> Callable[[Array], Array]:
         """

@@ -9,14 +9,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.solvers import runge_kutta_step, solve_riccati
+from koopman_ros.core.integration import runge_kutta_step
+from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.plants.system import checked_vector, ControlAffineSystem
 
 # Of half the box: so near the nominal state the linear law holds the plant.
 _HOME = 0.1
 # Of the slowest mode under the law, in which it must get there.
 _TIME_CONSTANTS = 10.0
-# Of the fastest mode's time constant, for which Runge-Kutta steps are exact enough.
+# Steps of a tenth of the fastest mode's time constant: the box is checked after each.
 _STEP = 0.1
 
 

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.integrate import DOP853
 
 from koopman_ros.core.arrays import Array, frozen
 from koopman_ros.core.datasets import DriftSamples, Episode
+from koopman_ros.core.integration import adaptive
 from koopman_ros.plants.system import ControlAffineSystem
 
 LOOSEST_RTOL = 1e-9
@@ -87,11 +87,7 @@ def integration_limits(system: ControlAffineSystem, rtol: float = 1e-10,
 def hold(system: ControlAffineSystem, start: Array, u: Array, duration: float,
          limits: Limits, *, start_time: float = 0.0) -> Array:
     """
-    Integrate a state over one hold with the explicit Runge-Kutta pair DOP853.
-
-    Why not LSODA: every input step is a kink after which a multistep method has to build up its
-    history again, so that over one second it is not quicker, and its error at the same tolerance
-    is larger by orders of magnitude. The plants are not stiff within their bounds.
+    Integrate a state over one hold; the plants are not stiff within their bounds.
 
     :param start_time: time of its start, for the message of an error.
     :return: the state at its end (n_x,).
@@ -112,20 +108,15 @@ def hold(system: ControlAffineSystem, start: Array, u: Array, duration: float,
         # DOP853 would never return from a first step that begins with an infinite rate
         if not np.all(np.isfinite(rate(0.0, start))):
             raise failed(IntegrationFailure.NON_FINITE, 0.0, start)
-        if duration == 0.0:
-            return start.copy()
-        solver = DOP853(rate, 0.0, start, duration, rtol=limits.rtol, atol=limits.atol,
-                        first_step=duration)
-        for _ in range(_MAX_STEPS_PER_HOLD):
-            solver.step()
-            x: Array = solver.y
-            if solver.status == 'failed':
-                raise failed(IntegrationFailure.STEP_TOO_SMALL, solver.t, x)
-            if not _inside(x, limits):
-                raise failed(IntegrationFailure.OUT_OF_BOUNDS, solver.t, x)
-            if solver.status == 'finished':
-                return x
-        raise failed(IntegrationFailure.TOO_MANY_STEPS, solver.t, x)
+        end, arrived = adaptive(
+            rate, start, duration, rtol=limits.rtol, atol=limits.atol, most=_MAX_STEPS_PER_HOLD,
+            inside=lambda x: _inside(x, limits))
+    x: Array = end.y
+    if arrived:
+        return x
+    raise failed(IntegrationFailure.STEP_TOO_SMALL if end.status == 'failed' else
+                 IntegrationFailure.TOO_MANY_STEPS if _inside(x, limits) else
+                 IntegrationFailure.OUT_OF_BOUNDS, end.t, x)
 
 
 def _inside(x: Array, limits: Limits) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.integration import runge_kutta_step
 
 #: records to learn from, and the one to test on; columns are the time and the signals, with units
 Frames: TypeAlias = tuple[list[pd.DataFrame], pd.DataFrame]

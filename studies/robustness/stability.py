@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 
 from koopman_ros.control import Controller, SAFE, State, StepReport, Supervisor
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.integration import runge_kutta_step
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import Estimate
 from koopman_ros.evaluation import at, Loop

@@ -11,7 +11,7 @@ import pytest
 from koopman_ros.control import Controller, Mode, State
 from koopman_ros.control.laws import Weights
 from koopman_ros.core.datasets import DriftSamples, PlantDescription
-from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.integration import runge_kutta_step
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.evaluation.model_comparison import compare, PredictionWindows
 from koopman_ros.learning.lift.edmd import Edmd

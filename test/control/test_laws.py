@@ -13,7 +13,8 @@ from scipy.linalg import solve_continuous_are
 from koopman_ros.control import Controller, State, Tuning
 from koopman_ros.control.laws import averaged, feedback, Form, LAWS, recentred, riccati, Weights
 from koopman_ros.control.laws.base import steady_state_target
-from koopman_ros.core.solvers import runge_kutta_step, solve_riccati
+from koopman_ros.core.integration import runge_kutta_step
+from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.core.status import StatusCode
 from koopman_ros.estimation import Estimate
 from koopman_ros.evaluation import run_closed_loop

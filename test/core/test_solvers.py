@@ -7,12 +7,8 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag, expm, solve_continuous_are, solve_discrete_are
 
-from koopman_ros.core.solvers import (
-    over_interval,
-    runge_kutta_step,
-    solve_riccati,
-    spectral_radius,
-)
+from koopman_ros.core.integration import runge_kutta_step
+from koopman_ros.core.solvers import over_interval, solve_riccati, spectral_radius
 from koopman_ros.core.status import StatusCode
 
 SIZES = [(n, m) for n in range(1, 9) for m in range(1, 4)]
@@ -281,26 +277,6 @@ def test_the_interval_against_an_exponential_of_blocks(h):
         whole = expm(h * np.block([[F, np.eye(N)], [np.zeros((N, 2 * N))]]))
         assert np.linalg.norm(D - F @ whole[:N, N:]) <= 1e-13 * max(
             np.linalg.norm(D), h * np.linalg.norm(F))
-
-
-# Runge-Kutta steps.
-
-def test_linear_decay_is_the_taylor_polynomial_of_fourth_degree():
-    x, h = np.array([[2.0], [-1.0]]), np.array([[0.1], [0.3]])
-    a = -1.5 * h
-    expected = x * (1.0 + a + a ** 2 / 2.0 + a ** 3 / 6.0 + a ** 4 / 24.0)
-    np.testing.assert_allclose(runge_kutta_step(lambda x: -1.5 * x, x, h), expected, rtol=1e-15)
-
-
-def test_error_over_a_time_falls_with_the_fourth_power_of_the_step():
-    def end(steps):
-        x = np.array([0.5])
-        for _ in range(steps):
-            x = runge_kutta_step(np.square, x, 1.0 / steps)
-        return x[0]
-
-    # dx/dt = x^2 from 1/2 reaches 1 at 1
-    assert (end(20) - 1.0) / (end(40) - 1.0) == pytest.approx(16.0, rel=0.1)
 
 
 @pytest.mark.parametrize('value', [np.nan, np.inf])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.core.datasets import Episode
-from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.integration import runge_kutta_step
 from koopman_ros.learning.ensemble import inconsistency
 from koopman_ros.learning.identification import identify
 from support.known_plants import CUBIC, methods

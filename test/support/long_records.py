@@ -11,8 +11,8 @@ import struct
 import numpy as np
 
 from koopman_ros.core.arrays import Array
+from koopman_ros.core.integration import runge_kutta_step
 from koopman_ros.core.message_fields import MessageField
-from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.core.units import NANOSECONDS, SECONDS_PER_MINUTE
 from koopman_ros.learning import TrainingTask
 from koopman_ros.learning.identification import Drift

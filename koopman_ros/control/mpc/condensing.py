@@ -6,6 +6,7 @@
 import numpy as np
 
 from koopman_ros.core.arrays import Array
+from koopman_ros.core.integration import integrate
 from koopman_ros.model import LiftedModel
 
 
@@ -14,8 +15,8 @@ def roll_out(model: LiftedModel, u: Array, x: Array, w: Array, x_ref: Array, u_r
     """
     Integrate dx/dt = f(x) + B(x) u + w over intervals, each from a node and under a held input.
 
-    By the Runge-Kutta method of order 4; the cost by Simpson's rule, with the middle of a step
-    from the rates at both ends (Hermite). All in scaled deviations and the model's time unit.
+    By Runge-Kutta steps of the state, its sensitivities and the cost. All in scaled deviations and
+    the model's time unit.
 
     :param u: (N, n_u) inputs.
     :param x: (N + 1, n_x) nodes, the last of which is not used.
@@ -30,37 +31,26 @@ def roll_out(model: LiftedModel, u: Array, x: Array, w: Array, x_ref: Array, u_r
     :raises LinAlgError: where the model gives no rate.
     """
     (N, m), n = u.shape, x.shape[1]
-    X = np.zeros((N, n, 1 + n + m))
-    X[:, :, 0], X[:, :, 1:1 + n] = x[:-1], np.eye(n)
+    # the state with its sensitivities in the first n rows, the cost below
+    start = np.zeros((N, 1 + 2 * n + m, 1 + n + m))
+    start[:, :n, 0], start[:, :n, 1:1 + n] = x[:-1], np.eye(n)
     v = np.zeros((N, m, 1 + n + m))
     v[:, :, 0], v[:, :, 1 + n:] = u - u_ref, np.eye(m)
-    cost = lengths[:, None, None] * (v.swapaxes(1, 2) @ R @ v)
-    h = (lengths / steps)[:, None, None]
+    effort = v.swapaxes(1, 2) @ R @ v
 
-    def rates(X: Array) -> Array:
-        at = X[:, :, 0]
-        f, J = model.drift_and_jacobian(at)
-        dX: Array = (J + model.forcing_jacobian(at, u)) @ X
-        dX[:, :, 0] = f + model.forcing(at, u) + w
+    def rates(Y: Array) -> Array:
+        X, at = Y[:, :n], Y[:, :n, 0]
+        rate, slope = model.rate_and_slope(at, u)
+        dX = slope @ X
+        dX[:, :, 0] = rate + w
         dX[:, :, 1 + n:] += model.input_matrix(at)
-        return dX
-
-    def weighed(X: Array) -> Array:
         error = X.copy()
         error[:, :, 0] -= x_ref
-        return np.asarray(h / 6.0 * (error.swapaxes(1, 2) @ Q @ error))
+        return np.concatenate((dX, error.swapaxes(1, 2) @ Q @ error + effort), axis=1)
 
     with np.errstate(all='ignore'):
-        for _ in range(steps):
-            k1 = rates(X)
-            k2 = rates(X + 0.5 * h * k1)
-            k3 = rates(X + 0.5 * h * k2)
-            k4 = rates(X + h * k3)
-            end = X + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-            middle = 0.5 * (X + end) + 0.125 * h * (k1 - k4)
-            cost += weighed(X) + 4.0 * weighed(middle) + weighed(end)
-            X = end
-    return X, cost
+        end = integrate(rates, start, lengths[:, None, None], steps)
+    return end[:, :n], end[:, n:]
 
 
 def condense(x: Array, start: Array, x_ref: Array, ends: Array, cost: Array, terminal: Array

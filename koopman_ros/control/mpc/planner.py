@@ -18,11 +18,8 @@ from koopman_ros.control.laws.riccati import feedback
 from koopman_ros.control.mpc.condensing import condense, roll_out
 from koopman_ros.control.mpc.grid import HorizonGrid
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.solvers import (
-    RiccatiSolution,
-    runge_kutta_step,
-    solve_riccati,
-)
+from koopman_ros.core.integration import fastest_rate, integrate, StepRule
+from koopman_ros.core.solvers import RiccatiSolution, solve_riccati
 from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.estimation import Estimate, held_means
 from koopman_ros.model import LiftedModel
@@ -32,9 +29,10 @@ _MAX_INTERVALS, _MIN_INTERVALS = 30, 3
 # The horizon is so many time constants of the closed loop, unless the plant is unstable: over more
 # than this many of its time constants the effect of an input is too large to compute with.
 _CLOSED_LOOP, _UNSTABLE = 6.0, 8.0
-# A Runge-Kutta step is no longer than this share of the drift's fastest time constant. Intervals
-# grow to so many steps at the nominal point, and have at most the last number elsewhere.
-_STEP, _STEPS, _MAX_STEPS = 0.7, 6, 32
+# Longer steps than those of a filter: a plan is corrected at the next sample.
+_RULE = StepRule(time_constants=0.7, most=32)
+# Intervals grow to so many steps of integration at the nominal point.
+_STEPS = 6
 _DIVERGED = 2.0  # distance in half-ranges, beyond which a simulated plan is of no use
 # Distance from a limit, scaled, at which it is active: of inputs, and of states, which follow from
 # all inputs.
@@ -131,8 +129,9 @@ class Planner:
             tuple(end.x.tolist()),
             () if model.input_terms is None else tuple(end.u.tolist()),
             grid.sample)
-        rate = max(_fastest(self._slope), fastest, _fastest(model.drift_jacobian(estimate.x)))
-        steps = min(max(math.ceil(grid.lengths[-1] * rate / _STEP), 1), _MAX_STEPS)
+        rate = max(fastest_rate(self._slope), fastest,
+                   fastest_rate(model.drift_jacobian(estimate.x)))
+        steps = _RULE.count(float(grid.lengths[-1]), rate) or _RULE.most
         return PlanningProblem(
             estimate.x, estimate.w, target,
             None if previous is None else model.inputs.to_deviation(previous), grid, steps,
@@ -179,8 +178,8 @@ class Planner:
         horizon += after
         count = int(min(max(math.ceil(horizon / sample), _MIN_INTERVALS), _MAX_INTERVALS))
         # modes much faster than those of the closed loop end it sooner
-        fastest = _fastest(A)
-        longest = max(sample, _STEPS * _STEP / fastest if fastest else math.inf)
+        fastest = fastest_rate(A)
+        longest = max(sample, _STEPS * _RULE.time_constants / fastest if fastest else math.inf)
         return HorizonGrid.growing(horizon, sample, count, longest)
 
     def _new_cost(self, x_ref: tuple[float, ...], u_ref: tuple[float, ...], sample: float
@@ -188,7 +187,7 @@ class Planner:
         """Return the rate of the fastest mode at a target, and the cost (n_x, n_x) from there."""
         model, x = self._model, np.array(x_ref)
         A = model.drift_jacobian(x)
-        fastest = _fastest(A)
+        fastest = fastest_rate(A)
         if u_ref:
             A = A + model.forcing_jacobian(x, np.array(u_ref))
         found = self._regulator(A, model.input_matrix(x), sample)
@@ -232,8 +231,7 @@ class Planner:
             last = u if last is None else np.where(free, u, last)
             u = np.where(free, u, known)
             rate = model.rate_under(u, problem.w)
-            for _ in range(problem.steps):
-                x = runge_kutta_step(rate, x, length / problem.steps)
+            x = integrate(rate, x, length, problem.steps)
             inputs.append(u)
             nodes.append(x)
             if not (np.isfinite(x).all() and model.distances(x[None])[0] < _DIVERGED):
@@ -316,11 +314,6 @@ class Planner:
                     problem.commanded(problem.change), _AT_INPUT),
             _active(x[1:].min(axis=0), x[1:].max(axis=0), self._state_lower, self._state_upper,
                     _AT_STATE))
-
-
-def _fastest(slope: Array) -> float:
-    """Return the rate of the fastest mode of a slope (n_x, n_x) of the drift."""
-    return float(np.max(np.abs(np.linalg.eigvals(slope))))
 
 
 def _active(least: Array, most: Array, lower: Array, upper: Array, tolerance: float) -> Array:

@@ -134,6 +134,15 @@ static mat inverse(mat A) {
     return X;
 }
 
+/* The size of the fastest mode of A, from its power 8 */
+static double fastest_rate(mat A) {
+    double whole = size(A);
+    if (!(whole > 0.0 && whole < INFINITY)) return whole;
+    A = scaled(1.0 / whole, A);
+    EACH(k, 3) A = mul(A, A);
+    return whole * pow(size(A), 0.125);
+}
+
 /* Whether all eigenvalues of A are within the unit circle: a power of A decides. */
 static int contracts(mat A) {
     EACH(k, 50) {
@@ -663,24 +672,30 @@ static int usable(const koopman_estimate *e) {
  * what x and w were. */
 static int predicted(int linear, koopman_estimate *e, const double *input, double seconds,
                      int covariance) {
-    double count = larger(1.0, ceil(seconds * STEP_RATE)), h = seconds / TIME_UNIT / count;
+    static const double ahead[] = {0.0, 0.5, 0.5, 1.0}, parts[] = {1.0, 2.0, 2.0, 1.0};
+    mat y = joined(of(NX, 1, e->x), input_deviation(input)), w = of(NX, 1, e->w), J;
+    rate_under(linear, y, w, &J);
+    double duration = seconds / TIME_UNIT;
+    double fastest = larger(fastest_rate(block(J, 0, 0, NX, NX)), FASTEST_RATE * TIME_UNIT);
+    double count = ceil(duration * fastest / STEP_LENGTH - 1e-9);
     int width = covariance ? WIDTH : 1;
-    mat all = zeros(NX, width), rate = all, J, F = diagonal(NP, 1.0);
-    if (!(count <= MOST_STEPS)) return 0;
+    mat all = zeros(NX, width), rate = all, F = diagonal(NP, 1.0);
+    if (!(count <= STEP_MOST)) return 0;
+    count = larger(1.0, count);
     if (covariance) put(&all, 0, 1, diagonal(NX, 1.0));
     put(&all, 0, 0, of(NX, 1, e->x));
     EACH(k, count) {
         mat sum = zeros(NX, width);
-        EACH(stage, STAGES) {
-            mat at = plus(all, AHEAD[stage] * h, rate), x;
-            x = rate_under(linear, joined(block(at, 0, 0, NX, 1), input_deviation(input)),
-                           of(NX, 1, e->w), covariance ? &J : NULL);
+        EACH(stage, 4) {
+            mat at = plus(all, ahead[stage] * duration / count, rate), x;
+            put(&y, 0, 0, block(at, 0, 0, NX, 1));
+            x = rate_under(linear, y, w, covariance ? &J : NULL);
             if (covariance) rate = mul(block(J, 0, 0, NX, NX), at);
             put(&rate, 0, 0, x);
             EACH(i, covariance ? NX : 0) rate.a[i * width + 1 + NX + i] += 1.0;
-            sum = plus(sum, PARTS[stage], rate);
+            sum = plus(sum, parts[stage], rate);
         }
-        all = plus(all, h / 6.0, sum);
+        all = plus(all, duration / count / 6.0, sum);
     }
     store(block(all, 0, 0, NX, 1), e->x);
     if (covariance) {

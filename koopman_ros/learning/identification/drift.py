@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from koopman_ros.core.arrays import short_repr
 from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.datasets import Array, Episode, PlantDescription, sample_interval
-from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.integration import runge_kutta_step
 from koopman_ros.learning.identification.simulation import fitted, simulated
 from koopman_ros.model import Box, InputTerms, PolynomialObservables
 from koopman_ros.model.observables import Monomials

@@ -14,7 +14,7 @@ import numpy as np
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.datasets import Episode
-from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.integration import runge_kutta_step
 from koopman_ros.learning.identification.drift import Drift, DriftModel, Segments
 from koopman_ros.learning.identification.simulation import fitted, simulated
 from koopman_ros.learning.identification.weak_form import regress

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from koopman_ros.core.datasets import Array
-from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.integration import runge_kutta_step
 from koopman_ros.learning.identification.drift import Drift, DriftModel, Segments
 from koopman_ros.learning.identification.innovations_form import Predictor
 from koopman_ros.learning.identification.network_drift import NetworkDrift

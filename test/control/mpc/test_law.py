@@ -19,8 +19,8 @@ from koopman_ros.control.laws.base import LawResult, steady_state_target
 from koopman_ros.control.mpc import MPCParameters, RecedingHorizon
 from koopman_ros.control.mpc.grid import HorizonGrid
 from koopman_ros.control.state import State
+from koopman_ros.core.integration import runge_kutta_step
 from koopman_ros.core.paths import model_path
-from koopman_ros.core.solvers import runge_kutta_step
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import Estimate

@@ -16,7 +16,7 @@ from scipy.special import chdtri
 import torch
 
 from koopman_ros.core.datasets import cut, Episode
-from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.integration import runge_kutta_step
 from koopman_ros.learning.identification import (
     box_of,
     DriftModel,

@@ -11,7 +11,7 @@ import pytest
 from scipy.special import chdtri
 
 from koopman_ros.core.datasets import Episode, PlantDescription
-from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.integration import runge_kutta_step
 from koopman_ros.learning.identification import estimate_parameters, EstimateStatus, Stopped
 from koopman_ros.learning.identification.equations import Equations
 from koopman_ros.plants import (

@@ -11,7 +11,7 @@ import pytest
 
 from koopman_ros.control.experiment import Experiment
 from koopman_ros.core.datasets import cut, Episode, PlantDescription
-from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.integration import runge_kutta_step
 from koopman_ros.learning.identification import (
     identify,
     longest_step,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.core.datasets import Episode, PlantDescription
-from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.integration import runge_kutta_step
 from koopman_ros.execution import Serial
 from koopman_ros.learning.identification import (
     identify_structure,

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from koopman_ros.core.datasets import Episode, PlantDescription
+from koopman_ros.core.integration import runge_kutta_step
 from koopman_ros.core.message_fields import place
-from koopman_ros.core.solvers import differences, runge_kutta_step
+from koopman_ros.core.solvers import differences
 from koopman_ros.learning import retrain, TrainingTask
 from koopman_ros.learning.identification import identify_non_affine, with_lag
 from koopman_ros.learning.identification.drift import longest_step, Segments

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.integration import runge_kutta_step
 from koopman_ros.learning.identification.simulation import simulated
 
 A = np.array([[-1.0, 2.0], [-2.0, -0.5]])

@@ -11,7 +11,7 @@ import pytest
 from scipy.optimize import fsolve
 
 from koopman_ros.core.datasets import Episode, PlantDescription
-from koopman_ros.core.solvers import runge_kutta_step
+from koopman_ros.core.integration import runge_kutta_step
 from koopman_ros.learning.identification import (
     DriftModel,
     identify_structure,
