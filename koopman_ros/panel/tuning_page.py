@@ -147,7 +147,7 @@ def _range(parameter: ParameterDescription) -> str:
 
 def exported(node: str, found: Mapping[str, ParameterDescription]) -> str:
     """Return the parameter file of a node."""
-    lines = [f'{node}:', '  ros__parameters:']
+    lines = [f'/**/{node}:', '  ros__parameters:']
     for name, one in found.items():
         unit = f'  # [{sanitize_text(one.unit, _MAX_UNIT)}]' if one.unit else ''
         key = name if _NAME.fullmatch(name) else json.dumps(name)

@@ -390,8 +390,10 @@ def file_parameters(path: Path, node: str) -> dict[str, Any]:
     """Return the parameters of a node, by name, from a ROS parameter file."""
     content = _content(path)
     values: dict[str, Any] = {}
-    for section in ('/**', node):
-        _flatten('', content.get(section, {}).get('ros__parameters', {}), values)
+    for section, found in content.items():
+        # for a node of the usual name, without a namespace
+        if section in ('/**', node, f'/{node}', f'/**/{node}'):
+            _flatten('', found.get('ros__parameters', {}), values)
     return values
 
 

@@ -27,8 +27,8 @@ from koopman_ros.ros.process import (
     events_executor,
     init,
     LONGEST_WAIT,
-    open_to_the_network,
     PROFILES,
+    start_warnings,
     take_down,
     TAKE_DOWN_PATIENCE,
 )
@@ -77,7 +77,8 @@ class Host:
     :param create: makes the node of one loop, given its namespace and the hosting.
     """
 
-    def __init__(self, name: str, create: Callable[..., LoopNode], loops: Sequence[str]) -> None:
+    def __init__(self, name: str, create: Callable[..., LoopNode], loops: Sequence[str],
+                 args: list[str] | None) -> None:
         self._create, self._loops = create, loops
         self._waiting = list(reversed(loops))
         self._nodes: dict[str, LoopNode] = {}  # that run, by namespace
@@ -94,7 +95,7 @@ class Host:
         self._diagnostics = Diagnostics(self._node).add('loops', self._status)
         self._delay, self._looked = 0.0, time.monotonic()
         wall_timer(self._node, _PERIOD, self._look)
-        if note := open_to_the_network(os.environ):
+        for note in start_warnings(name, f'{loops[0]}/{name}', args):
             self._node.get_logger().warning(note)
 
     def run(self, arrived: Sequence[int]) -> int:
@@ -222,7 +223,7 @@ def run_loops(name: str, create: Callable[..., LoopNode], args: list[str] | None
             loops = read_loops(Path(file))
             _be_lean(os.environ)
             init(args)
-            host = Host(name, create, loops)
+            host = Host(name, create, loops, args)
         except START_ERRORS as error:
             print(f'{name}: cannot start: {one_line(error)}', file=sys.stderr)
             return 1

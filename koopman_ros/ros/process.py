@@ -23,6 +23,7 @@ from koopman_ros.core.paths import LOOPBACK_PROFILE
 from koopman_ros.process_entry import force_exit_after, handle_signals
 from koopman_ros.ros.managed import ManagedNode, one_line, START_ERRORS
 from koopman_ros.ros.node import LoopNode
+from koopman_ros.ros.parameter_files import ignored_sections
 from koopman_ros.ros.watchdog import end_in_time
 
 PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
@@ -64,7 +65,7 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
         except START_ERRORS as error:
             print(f'{name}: cannot start: {one_line(error)}', file=sys.stderr)
             return 1
-        if note := open_to_the_network(os.environ):
+        for note in start_warnings(name, node.get_fully_qualified_name(), args):
             node.get_logger().warning(note)
         while not arrived and node.exit_code is None:
             # Python handles a signal when the wait returns, so the wait is bounded
@@ -194,6 +195,12 @@ def answer(name: str, args: list[str] | None, hosts: bool = False) -> int | None
     print(f'{name}: unknown argument {rest[0][:100]!r}: pass parameters as --ros-args -p '
           'name:=value; see --help', file=sys.stderr)
     return 2
+
+
+def start_warnings(program: str, full_name: str, args: list[str] | None) -> list[str]:
+    """Return warnings about the command line and the environment of a node."""
+    return [*ignored_sections(sys.argv if args is None else args, program, full_name),
+            *filter(None, [open_to_the_network(os.environ)])]
 
 
 def open_to_the_network(environment: Mapping[str, str]) -> str:

@@ -437,7 +437,7 @@ def test_parameters_are_set_checked_and_rejected(site: Site) -> None:
         while line not in (text := exported()) and time.monotonic() < deadline:
             page.wait_for_timeout(100.0)
         assert line in text
-        assert text.startswith('controller:\n  ros__parameters:\n')
+        assert text.startswith('/**/controller:\n  ros__parameters:\n')
 
 
 # Controls that are not disabled.

@@ -117,4 +117,4 @@ def test_exported_parameters_are_yaml_of_the_same_names_whatever_these_are() -> 
     found = HostileSource().snapshot.parameters['controller']
     found = {f'{name}\n  :': view for name, view in found.items() if isinstance(view.value, float)}
     read = yaml.safe_load(exported('controller', found))
-    assert read == {'controller': {'ros__parameters': dict.fromkeys(found, 1.0)}}
+    assert read == {'/**/controller': {'ros__parameters': dict.fromkeys(found, 1.0)}}
