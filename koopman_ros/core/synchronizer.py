@@ -3,9 +3,11 @@
 
 """Signals of several messages put together by stamp."""
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
+from statistics import median_low
 
 import numpy as np
 
@@ -14,6 +16,7 @@ from koopman_ros.core.units import LATE_NANOSECONDS
 
 _MOST_OPEN = 100  # samples that wait for a part
 _LONGEST_WAIT = 10  # samples that are completed meanwhile
+_REMEMBERED = 9  # messages of each signal, by which its usual interval is known
 
 
 @dataclass
@@ -21,13 +24,16 @@ class SampleSynchronizer:
     """The parts that wait for others, and the counts of lost ones, by name of the signal."""
 
     names: Sequence[str]  #: (n,) of the signals, in the order of a sample
-    tolerance_ns: int = 0  #: how far stamps of one sample may be apart
+    #: how far stamps of one sample may be apart; None, for times of receipt: half the usual
+    #: interval of the signal that comes most often
+    tolerance_ns: int | None = 0
     late: Counter[str] = field(default_factory=Counter)  #: came after their sample was complete
     missing: Counter[str] = field(default_factory=Counter)  #: did not come before a later sample
     duplicated: Counter[str] = field(default_factory=Counter)  #: came twice; the later one counts
     _open: dict[int, dict[str, float]] = field(default_factory=dict)  # in order of arrival
     _opened: dict[int, int] = field(default_factory=dict)  # after how many completed samples
     _completed: int = 0
+    _times: dict[str, deque[int]] = field(default_factory=dict)  # of the last messages
     _last_ns: int | None = None
 
     def take(self, stamp_ns: int, values: Mapping[str, float]) -> tuple[int, Array] | None:
@@ -44,11 +50,16 @@ class SampleSynchronizer:
             # time was set back
             self._open.clear()
             self._opened.clear()
+            self._times.clear()
             self._last_ns = None
-        if self._last_ns is not None and stamp_ns <= self._last_ns + self.tolerance_ns:
+        tolerance_ns = self.tolerance_ns
+        if tolerance_ns is None:
+            # a time of receipt is never late
+            tolerance_ns = self._usual_tolerance(stamp_ns, values)
+        elif self._last_ns is not None and stamp_ns <= self._last_ns + tolerance_ns:
             self.late.update(values.keys())
             return None
-        near = [time for time in self._open if abs(time - stamp_ns) <= self.tolerance_ns]
+        near = [time for time in self._open if abs(time - stamp_ns) <= tolerance_ns]
         at = min(near, key=lambda time: abs(time - stamp_ns), default=stamp_ns)
         parts = self._open.setdefault(at, {})
         self._opened.setdefault(at, self._completed)
@@ -66,6 +77,12 @@ class SampleSynchronizer:
             # the first to arrive, since a stamp may be wrong
             self._give_up(next(iter(self._open)))
         return None
+
+    def _usual_tolerance(self, stamp_ns: int, values: Mapping[str, float]) -> int:
+        for name in values:
+            self._times.setdefault(name, deque(maxlen=_REMEMBERED)).append(stamp_ns)
+        return min((median_low(after - before for before, after in pairwise(times)) // 2
+                    for times in self._times.values() if len(times) > 1), default=0)
 
     def _give_up(self, time: int) -> None:
         del self._opened[time]

@@ -182,8 +182,8 @@ class PlantNode(ManagedNode):
         if self._phase is RunPhase.WAITING:
             listeners = min(publisher.get_subscription_count() for publisher in self._counted)
             if listeners >= self._settings.lockstep_subscribers and all(
-                    self.count_publishers(subscription.topic_name) > 0
-                    for subscription in self._command_subscriber.subscriptions):
+                    self.count_publishers(topic) > 0
+                    for topic in self._command_subscriber.topics):
                 self._phase = RunPhase.RUNNING
                 self._measure()
             return

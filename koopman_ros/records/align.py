@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.records.import_spec import RecordedState
-from koopman_ros.records.segments import Clock, Segment, Times
+from koopman_ros.records.segments import Clock, NO_STAMP, Segment, Times
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,12 @@ class AlignedSamples:
 
 def align_by_timestamp(segment: Segment, clock: Clock, states: Sequence[RecordedState],
                        tolerance_ns: int, dropped: Counter[str]) -> AlignedSamples:
-    """Align the measurements of a segment by stamp; count those without a partner."""
+    """
+    Align the measurements of a segment by stamp; count those without a partner.
+
+    :param tolerance_ns: how far the stamps of one sample may be apart; with 0, for times of
+        receipt, half the usual interval of the signal that comes most often.
+    """
     parts = []
     for signal in states:
         entries = clock.on(segment.of(signal.place))
@@ -38,6 +43,11 @@ def align_by_timestamp(segment: Segment, clock: Clock, states: Sequence[Recorded
         dropped[named(states, signal, 'measurement with a repeated stamp')] += (
             len(entries) - len(parts[-1]))
     times = [part.stamp_ns for part in parts]
+    usual = min((float(np.median(np.diff(own))) for own in times if len(own) > 1), default=0.0)
+    if not tolerance_ns and any(
+            np.any(segment.of(signal.place).stamp_ns == NO_STAMP) for signal in states):
+        # as in the running controller
+        tolerance_ns = int(usual) // 2
     base = min(times, key=len)
     rows = [_nearest(own, base) for own in times]
     complete = np.ones(len(base), dtype=bool)
@@ -46,7 +56,7 @@ def align_by_timestamp(segment: Segment, clock: Clock, states: Sequence[Recorded
         complete &= ((np.abs(own[row] - base) <= tolerance_ns)
                      & (_nearest(base, own)[row] == np.arange(len(base))))
     rows = [row[complete] for row in rows]
-    _count_others(states, times, rows, tolerance_ns, dropped)
+    _count_others(states, times, rows, tolerance_ns, usual, dropped)
     x = np.column_stack([part.values[row] for part, row in zip(parts, rows, strict=True)])
     logs = np.max([part.log_ns[row] for part, row in zip(parts, rows, strict=True)], axis=0)
     every = np.column_stack([own[row] for own, row in zip(times, rows, strict=True)])
@@ -60,9 +70,8 @@ def named(states: Sequence[RecordedState], state: RecordedState, text: str) -> s
 
 
 def _count_others(states: Sequence[RecordedState], times: Sequence[Times], rows: Sequence[Times],
-                  tolerance_ns: int, dropped: Counter[str]) -> None:
+                  tolerance_ns: int, usual: float, dropped: Counter[str]) -> None:
     """Count the measurements of each state that are in no sample, by the reason."""
-    usual = min((float(np.median(np.diff(own))) for own in times if len(own) > 1), default=0.0)
     seconds = f'{tolerance_ns / NANOSECONDS:g} s'
     for signal, own, row in zip(states, times, rows, strict=True):
         left = np.delete(own, row)

@@ -31,7 +31,6 @@ from koopman_ros.control.experiment import (
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import base_name, MessageField
 from koopman_ros.core.status import Reason, reason, StatusCode
-from koopman_ros.core.synchronizer import SampleSynchronizer
 from koopman_ros.core.units import NANOSECONDS, quantity_text, values_by_name
 from koopman_ros.event_log import records
 from koopman_ros.parameters.signal_topics import SignalTopics
@@ -45,6 +44,7 @@ from koopman_ros.ros.signals import (
     SignalPublisher,
     SignalSample,
     SignalSubscriber,
+    synchroniser,
 )
 from koopman_ros.ros.time_conversion import stamp_message, stamp_nanoseconds
 
@@ -99,8 +99,8 @@ class ExperimentRun:
         self._monitors = [TrackingMonitor(span)
                           for span in (self.plan.upper - self.plan.lower).tolist()]
         self._subscriptions: list[Subscription] = []
-        self._assembler = SampleSynchronizer(
-            tuple(signals.states), round(settings.synchronisation_tolerance * NANOSECONDS))
+        self._assembler = synchroniser(
+            wiring.measured, signals.states, settings.synchronisation_tolerance)
         self._measured = SignalSubscriber(
             node, self._subscribe, wiring.measured, signals.states, self._on_measurement)
         self._answers = SignalSubscriber(

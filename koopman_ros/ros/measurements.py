@@ -9,14 +9,19 @@ from typing import NamedTuple
 import numpy as np
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.synchronizer import SampleSynchronizer
 from koopman_ros.core.time_base import TimeBase
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.parameters.signal_topics import LONGEST_FRAME_ID, QUALITY, SignalTopics
 from koopman_ros.ros import topics
 from koopman_ros.ros.hosted import HostedNode
-from koopman_ros.ros.signals import InputWait, MeasuredInputs, SignalSample, SignalSubscriber
+from koopman_ros.ros.signals import (
+    InputWait,
+    MeasuredInputs,
+    SignalSample,
+    SignalSubscriber,
+    synchroniser,
+)
 from koopman_ros.ros.timing import Timing
 
 
@@ -52,9 +57,9 @@ class Measurements:
             if seconds > 0.0}
         self._clock = node.get_clock()
         self._reported: dict[str, tuple[int, float]] = {}  # when it came, in ns, and value
-        self.assembler = SampleSynchronizer(
-            tuple(name for name in signals.states if name not in self._heartbeats),
-            round(settings.synchronisation_tolerance * NANOSECONDS))
+        self.assembler = synchroniser(
+            wiring.measured, [name for name in signals.states if name not in self._heartbeats],
+            settings.synchronisation_tolerance)
         if not self.assembler.names:
             self._ticked_ns = -1
             self._shortest_ns = round(0.5 * settings.sample_time * NANOSECONDS)
@@ -81,7 +86,9 @@ class Measurements:
         if measured.unstamped:
             node.get_logger().warning(
                 f'messages of {", ".join(measured.unstamped)} have no stamp: the time of receipt '
-                'is used')
+                'is used' + ('; messages of one measurement may be half a sample period apart, or '
+                             'synchronisation_tolerance, if it is set' * (
+                                 self.assembler.tolerance_ns is None)))
         self._active = False
 
     def begin(self, timing: Timing, window: Callable[[], float], commanded: Callable[[], bool]

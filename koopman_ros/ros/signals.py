@@ -19,6 +19,7 @@ from rclpy.timer import Timer
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import MessageField
+from koopman_ros.core.synchronizer import SampleSynchronizer
 from koopman_ros.core.units import Conversion, conversion, in_steps, NANOSECONDS
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.ros import topics
@@ -88,6 +89,24 @@ def _with_info(take: Callable[[Any, Mapping[str, Any]], None]) -> Callable[..., 
     return callback
 
 
+def synchroniser(places: Mapping[str, MessageField], names: Collection[str], tolerance: float
+                 ) -> SampleSynchronizer:
+    """
+    Return a synchroniser of the messages of measurements.
+
+    Where one of several topics has no stamps, and no tolerance is set, it follows from the
+    intervals between the messages.
+
+    :param places: by name of the signal.
+    :param names: of the signals in a measurement.
+    :param tolerance: s between the stamps of one measurement; 0 for the default.
+    """
+    kinds = [kind for _, kind, _ in by_topic({name: places[name] for name in names})]
+    unstamped = len(kinds) > 1 and not all(hasattr(kind, 'header') for kind in kinds)
+    return SampleSynchronizer(
+        tuple(names), None if unstamped and not tolerance else round(tolerance * NANOSECONDS))
+
+
 class SignalSubscriber:
     """
     Subscribe to some signals.
@@ -106,7 +125,8 @@ class SignalSubscriber:
                  places: Mapping[str, MessageField], units: Mapping[str, str],
                  callback: Callable[[SignalSample], None]) -> None:
         self._node, self._callback = node, callback
-        self.subscriptions: list[Subscription] = []
+        self.subscriptions: list[Subscription] = []  #: as they were made
+        self.topics: list[str] = []  #: with their namespace
         self.unstamped: list[str] = []  #: topics whose messages are stamped at their arrival
         for topic, kind, names in by_topic(places):
             own = {name: (places[name], _converted(name, places[name].unit, units[name]))
@@ -115,6 +135,7 @@ class SignalSubscriber:
                 self.unstamped.append(topic)
             self.subscriptions.append(subscribe(topic, _with_info(
                 partial(self._take, topic, own)), kind))
+            self.topics.append(node.resolve_topic_name(topic))
 
     def _take(self, topic: str, own: Mapping[str, Any], message: Any, info: Mapping[str, Any]
               ) -> None:
@@ -135,7 +156,7 @@ class SignalSubscriber:
 
     def published(self) -> bool:
         """Whether one of the topics is published."""
-        return any(self._node.count_publishers(own.topic_name) for own in self.subscriptions)
+        return any(map(self._node.count_publishers, self.topics))
 
 
 class MeasuredInputs:

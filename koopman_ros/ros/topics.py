@@ -17,7 +17,7 @@ from rclpy.duration import Infinite
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
@@ -120,7 +120,7 @@ class EndpointMonitor:
 
     That is looked for twice a second, or less often where many loops share the process: each look
     asks the whole graph. The events of the middleware for it cost more than the answer to a
-    message.
+    message. Subscriptions are as reliable as their publishers, unless a parameter says otherwise.
 
     :param on_change: called when the complaint is another.
     :param exclusive: the verb phrase for topics on which only one node may publish.
@@ -129,7 +129,10 @@ class EndpointMonitor:
     def __init__(self, node: HostedNode, on_change: Callable[[], None],
                  exclusive: Mapping[str, str] | None = None) -> None:
         self._node, self._on_change, self._exclusive = node, on_change, exclusive or {}
-        self._own: list[Publisher | Subscription] = []
+        self._publishers: list[Publisher] = []
+        # with a function that subscribes by another profile, None where a parameter sets it
+        self._subscriptions: list[tuple[
+            Subscription, Callable[[QoSProfile], Subscription] | None]] = []
         self._last_complaints: tuple[str, ...] = ('', '')
         self._shared: dict[str, bool] = {}
         self._next_look = 0.0  # by the steady clock
@@ -148,18 +151,24 @@ class EndpointMonitor:
     def subscribe(self, topic: str, callback: Callable[[Any], Any], kind: Any = None,
                   qos: QoSProfile = LOOP_QOS) -> Subscription:
         """Subscribe to a topic, by default of its type in `TYPES`."""
-        # overriding parameters change the profile itself
-        made = self._node.create_subscription(
-            kind or TYPES[topic], topic, callback, copy.copy(qos),
-            qos_overriding_options=overridable())
-        self._own.append(made)
+        name = self._node.resolve_topic_name(topic)
+
+        def make(profile: QoSProfile) -> Subscription:
+            # overriding parameters change the profile itself
+            return self._node.create_subscription(
+                kind or TYPES[topic], topic, callback, copy.copy(profile),
+                qos_overriding_options=overridable() if fixed else QoSOverridingOptions(
+                    [QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH]))
+
+        fixed = self._node.has_parameter(f'qos_overrides.{name}.subscription.reliability')
+        self._subscriptions.append((made := make(qos), None if fixed else make))
         return made
 
     def publish(self, topic: str, kind: Any = None, qos: QoSProfile = LOOP_QOS) -> Publisher:
         """Publish a topic, by default of its type in `TYPES`."""
         made = self._node.create_publisher(
             kind or TYPES[topic], topic, copy.copy(qos), qos_overriding_options=overridable())
-        self._own.append(made)
+        self._publishers.append(made)
         return made
 
     def _look_in_turn(self) -> None:
@@ -172,6 +181,8 @@ class EndpointMonitor:
     def _look(self) -> None:
         conflicts = {topic: self._conflict(topic) for topic in self._exclusive}
         self._shared = {topic: bool(conflict) for topic, conflict in conflicts.items()}
+        self._subscriptions = [(self._adapted(own, make), make)
+                               for own, make in self._subscriptions]
         complaints = dict.fromkeys(
             complaint for own in self._own for complaint in self._complaints(own))
         texts = '; '.join(filter(None, conflicts.values())), '; '.join(complaints)
@@ -181,6 +192,27 @@ class EndpointMonitor:
                 self._node.get_logger().warning(complaint)
         if texts != before:
             self._on_change()
+
+    @property
+    def _own(self) -> list[Publisher | Subscription]:
+        return [*self._publishers, *(own for own, _ in self._subscriptions)]
+
+    def _adapted(self, own: Subscription, make: Callable[[QoSProfile], Subscription] | None
+                 ) -> Subscription:
+        """Return a subscription, or another one that is as reliable as the publishers now are."""
+        topic, profile, kind = own.topic_name, own.qos_profile, type_name(own.msg_type)
+        publishers = [info for info in self._node.get_publishers_info_by_topic(topic)
+                      if info.topic_type == kind]
+        wanted = matching_profile(profile, publishers, profile.depth).reliability
+        if make is None or wanted is profile.reliability:
+            return own
+        profile.reliability = wanted
+        self._node.destroy_subscription(own)
+        made = make(profile)
+        self._node.get_logger().info(
+            f'{topic}: subscribed {wanted.short_key.replace("_", " ")}, as published by '
+            + ', '.join(sorted(map(node_name, publishers))))
+        return made
 
     def _conflict(self, topic: str) -> str:
         # who publishes something else is not in conflict; a node may be there twice

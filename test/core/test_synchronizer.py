@@ -49,6 +49,27 @@ def test_stamps_may_be_apart_by_the_tolerance(apart, found):
     assert taken(assembler, (100, 'level', 1.0), (100 + apart, 'flow', 2.0)) == found
 
 
+@pytest.mark.parametrize('lag', [0.0, 0.02, 0.3, 0.48, 0.7, 0.95])
+def test_times_of_receipt_are_half_an_interval_apart_at_most(lag):
+    """Whatever the phase of the second sensor, and where a machine delays some by a little."""
+    assembler = SampleSynchronizer(NAMES, tolerance_ns=None)
+    times = sorted((SECOND * (k + lag * (name == 'flow') + 0.01 * (k * 7919 % 5)), name, k)
+                   for k in range(40) for name in NAMES)
+    found = taken(assembler, *((round(at), name, float(k)) for at, name, k in times))
+    assert len(found) >= 36
+    # the same pair each time, the nearer one
+    shift = 1.0 if lag > 0.5 else 0.0
+    assert [level - flow for _, (level, flow) in found[2:]] == [shift] * len(found[2:])
+
+
+def test_times_of_receipt_of_a_slow_and_a_quick_sensor():
+    assembler = SampleSynchronizer(NAMES, tolerance_ns=None)
+    parts = sorted([(SECOND * k, 'level', float(k)) for k in range(10)]
+                   + [(SECOND * k // 10 + 3, 'flow', k / 10) for k in range(100)])
+    found = taken(assembler, *parts)
+    assert [values for _, values in found[1:]] == [[float(k), float(k)] for k in range(2, 10)]
+
+
 def test_a_part_joins_the_nearest_incomplete_sample():
     assembler = SampleSynchronizer(('level', 'flow', 'heat'), tolerance_ns=10)
     assert not taken(assembler, (100, 'level', 1.0), (115, 'level', 2.0), (109, 'flow', 3.0))

@@ -402,8 +402,7 @@ def test_two_controllers_report_each_other_while_both_run(
         ros: Harness, run_node: RunNode) -> None:
     """Beside a best-effort thermometer, and a coolant that is promised and never told."""
     ros.node.create_publisher(Temperature, reactor.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
-    override = ('-p', 'qos_overrides./temperature.subscription.reliability:=best_effort')
-    bench = Bench(ros, arguments=override, qos=QoSProfile(
+    bench = Bench(ros, qos=QoSProfile(
         depth=10, reliability=ReliabilityPolicy.BEST_EFFORT), run_node=run_node)
     assert bench.commands[0].temperature > 25.0
     waited = []
@@ -417,7 +416,7 @@ def test_two_controllers_report_each_other_while_both_run(
     assert bench.active == pytest.approx(STEADY)
     bench.status(lambda s: s.message.startswith('automatic, no set-point yet'))
 
-    second = ros.start('controller', arguments=('-r', '__node:=controller_2', *override))
+    second = ros.start('controller', arguments=('-r', '__node:=controller_2'))
     ros.meet('controller_2')
     bench.measure(STEADY, 12.0)
     for name in ('controller', 'controller_2'):

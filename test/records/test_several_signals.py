@@ -153,6 +153,18 @@ def test_the_smallest_jump_is_in_the_unit_of_the_signal(
     assert len(episodes) == count
 
 
+def test_states_without_stamps_are_put_together_by_default(write: Callable[..., Path]) -> None:
+    """Within half the interval between two measurements."""
+    level = RecordedState('level', 'm', MessageField('/level', FLOAT, 'data', 'm'))
+    flow = RecordedState('flow', 'm', MessageField('/flow', FLOAT, 'data', 'm'))
+    path = write([*jacket(*[20.0] * 20), *(s for k in range(1, 21) for s in (
+        Sent('/level', None, 1.0 + 0.01 * k, k), Sent('/flow', None, 2.0 + 0.01 * k, k + 0.3)))])
+    (episode,), account = records.loop_episodes([path], [level, flow], [COMMANDED])
+    assert len(episode) == 20
+    assert (episode.x[:, 1] - episode.x[:, 0]).tolist() == pytest.approx([1.0] * 20)
+    assert 'no stamp' in ''.join(account.notes)
+
+
 def test_states_without_a_stamp_count_at_their_receipt(write: Callable[..., Path]) -> None:
     level = RecordedState('level', 'm', MessageField('/level', FLOAT, 'data', 'm'))
     # the stamps are simulated, ten times as fast as the recorder's clock

@@ -206,9 +206,6 @@ def pair(shared_ros: Harness) -> Iterator[Pair]:
     ('command', Temperature, QoSProfile(depth=1, deadline=Duration(seconds=1)), ('deadline',)),
     ('command', Temperature, QoSProfile(
         depth=1, liveliness=qos.LivelinessPolicy.MANUAL_BY_TOPIC), ('liveliness',)),
-    ('temperature', Temperature, BEST_EFFORT,
-     ('/temperature: /bench publishes', 'Best effort publisher and reliable subscription',
-      'qos_overrides./temperature.subscription.reliability:=best_effort')),
     ('temperature', JointState, topics.LOOP_QOS,
      ('/bench uses it for sensor_msgs/msg/JointState', 'remap'))])
 def test_another_end_that_does_not_match_is_reported_and_logged(
@@ -228,6 +225,33 @@ def test_another_end_that_does_not_match_is_reported_and_logged(
         pair.other.destroy_publisher(publisher)
     pair.wait(lambda: not pair.matching.complaint)
     assert f'[WARN] [own]: {complaint}\n' in re.sub(r' \[[0-9.]+\]', '', capfd.readouterr().err)
+
+
+def test_a_subscription_is_as_reliable_as_its_publishers(
+        pair: Pair, capfd: pytest.CaptureFixture[str]) -> None:
+    kinds = []
+    for profile in (BEST_EFFORT, topics.LOOP_QOS):
+        publisher = pair.other.create_publisher(Temperature, 'temperature', profile)
+
+        def subscribed(wanted: qos.ReliabilityPolicy = profile.reliability) -> bool:
+            found = pair.other.get_subscriptions_info_by_topic('/temperature')
+            return [one.qos_profile.reliability for one in found] == [wanted]
+
+        pair.wait(subscribed)
+        kinds.append(profile.reliability.short_key.replace('_', ' '))
+        assert not pair.matching.complaint
+        assert f'/temperature: subscribed {kinds[-1]}, as published by' in capfd.readouterr().err
+        pair.other.destroy_publisher(publisher)
+        pair.wait(lambda: pair.own.count_publishers('/temperature') == 0)
+
+
+def test_a_reliability_that_a_parameter_sets_stays(pair: Pair) -> None:
+    name = 'qos_overrides./jacket.subscription.reliability'
+    pair.own.declare_parameter(name, 'reliable')
+    pair.matching.subscribe('jacket', lambda _: None, Temperature)
+    publisher = pair.other.create_publisher(Temperature, 'jacket', BEST_EFFORT)
+    pair.wait(lambda: f'-p {name}:=best_effort' in pair.matching.complaint)
+    pair.other.destroy_publisher(publisher)
 
 
 def test_a_node_whose_name_has_not_arrived_is_another_node() -> None:
