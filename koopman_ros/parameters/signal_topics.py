@@ -33,6 +33,7 @@ from koopman_ros.core.units import (
     Displays,
     shown,
 )
+from koopman_ros.core.yaml_text import load_yaml
 from koopman_ros.model import Coordinates, LiftedModel
 from koopman_ros.parameters.table import ConfigurationError
 
@@ -387,24 +388,30 @@ def plant_defaults(system: str, node: str) -> dict[str, Any]:
 
 
 def file_parameters(path: Path, node: str) -> dict[str, Any]:
-    """Return the parameters of a node, by name, from a ROS parameter file."""
+    """
+    Return the parameters of a node, by name, from a ROS parameter file.
+
+    :raises ValueError: for a file that is no parameter file.
+    """
     content = _content(path)
     values: dict[str, Any] = {}
-    for section, found in content.items():
-        # for a node of the usual name, without a namespace
-        if section in ('/**', node, f'/{node}', f'/**/{node}'):
-            _flatten('', found.get('ros__parameters', {}), values)
+    try:
+        for section, found in content.items():
+            # for a node of the usual name, without a namespace
+            if section in ('/**', node, f'/{node}', f'/**/{node}'):
+                _flatten('', found.get('ros__parameters', {}), values)
+    except AttributeError as error:
+        raise ValueError(f'{path}: not a parameter file: write <node>: ros__parameters: <name>: '
+                         '<value>') from error
     return values
 
 
 @functools.cache
-def _content(path: Path) -> dict[str, Any]:
-    # in here: only at the start
-    import yaml
-
-    # by libyaml, which is in its wheels and in packages of distributions, ten times as fast
-    loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
-    return dict(yaml.load(path.read_text(), loader))
+def _content(path: Path) -> Any:
+    try:
+        return load_yaml(path.read_text())
+    except ValueError as error:
+        raise ValueError(f'{path}: {error}') from error
 
 
 def _flatten(prefix: str, tree: Mapping[str, Any], into: dict[str, Any]) -> None:

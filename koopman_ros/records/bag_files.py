@@ -7,8 +7,7 @@ import os
 from pathlib import Path, PurePath
 import re
 
-import yaml
-
+from koopman_ros.core.yaml_text import load_yaml
 from koopman_ros.records.mcap_file import BagReadError, is_closed, reason, RECOVER
 from koopman_ros.records.metadata import METADATA_FILE, METADATA_KEY
 
@@ -65,7 +64,7 @@ def _listed_files(folder: Path) -> tuple[Path, ...]:
     try:
         if source.stat().st_size > _MAX_METADATA_BYTES:
             raise ValueError(f'more than {_MAX_METADATA_BYTES} bytes')
-        information = yaml.safe_load(source.read_text('utf-8'))[METADATA_KEY]
+        information = load_yaml(source.read_text('utf-8'))[METADATA_KEY]
         compression = information.get('compression_format')
         # rosbag2 before version 4 lists them with the name of their folder
         names = [PurePath(name).name for name in information['relative_file_paths']]
@@ -75,9 +74,7 @@ def _listed_files(folder: Path) -> tuple[Path, ...]:
         storage = information.get('storage_identifier') or (
             'sqlite3' if any('.db3' in name for name in names) else 'mcap')
         missing = [name for name in names if not (folder / name).is_file()]
-    # the YAML parser itself fails in several ways, on a date without a 13th month among them
-    except (yaml.YAMLError, ValueError, KeyError, TypeError, AttributeError, RecursionError
-            ) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise BagReadError(
             f'{str(source)!r} is not the metadata of a bag ({reason(error)}): delete it and set '
             'recover to true to read the other files of the folder') from error

@@ -15,6 +15,7 @@ from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 import yaml
 
 from koopman_ros.core.paths import write_atomically
+from koopman_ros.core.yaml_text import load_yaml
 from koopman_ros.records.message_definitions import MessageDefinition
 
 METADATA_FILE = 'metadata.yaml'
@@ -35,6 +36,7 @@ def dump_offered_qos(profiles: Sequence[Qos]) -> str:
 def parse_offered_qos(text: str) -> tuple[Qos, ...]:
     """Return the profiles of a channel, of any version of rosbag2, or none if unreadable."""
     try:
+        load_yaml(text)
         return tuple(parse_qos(text))
     except Exception:
         # text of another recorder: it can be wrong in any way, and nothing depends on it

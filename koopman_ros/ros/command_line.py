@@ -20,6 +20,7 @@ from rclpy.task import Future
 import yaml
 
 from koopman_ros import __version__
+from koopman_ros.core.yaml_text import load_yaml
 from koopman_ros.ros import topics
 from koopman_ros.ros.process import init
 from koopman_ros.ros.remote_node import repeated
@@ -133,8 +134,8 @@ def _filled(message: Any, text: str | None) -> Any:
             setattr(part, name, value)
 
     try:
-        fill(message, yaml.safe_load(text or '{}'))
-    except (yaml.YAMLError, AssertionError, TypeError, ValueError) as error:
+        fill(message, load_yaml(text or '{}'))
+    except (AssertionError, TypeError, ValueError) as error:
         raise CommandError(f'{text!r} is not a valid {type(message).__name__}: {error}') from error
     return message
 
@@ -216,10 +217,11 @@ def _parameter(node: Node, options: argparse.Namespace) -> None:
     if options.value is None:
         print(present[0])
         return
-    value = yaml.safe_load(options.value)
-    if isinstance(present[0], str):
-        value = options.value
-    elif isinstance(present[0], float) and isinstance(value, int):
+    try:
+        value = options.value if isinstance(present[0], str) else load_yaml(options.value)
+    except ValueError as error:
+        raise CommandError(f'{options.value!r}: {error}') from error
+    if isinstance(present[0], float) and isinstance(value, int):
         value = float(value)
     result, = _repeated(node, options, lambda: client.set_parameters(
         [Parameter(options.name, value=value)])).results
