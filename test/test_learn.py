@@ -61,7 +61,7 @@ def day(tmp_path_factory):
 
 def test_a_file_is_learned_tested_and_reported(day):
     folder, printed = day
-    for words in ('level [m], pump [V]', '400 of 400 measurements used',
+    for words in ('level [m], pump [V]', '400 of 400 values used',
                   'the new model (linear) is acc', 'test: free run of 394 measurements'):
         assert words in printed
     model = load(folder / 'day.safetensors')

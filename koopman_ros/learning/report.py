@@ -45,7 +45,7 @@ def write_report(retrained: Retrained) -> list[Path]:
 
 def reported(retrained: Retrained) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Write the report; return the summary, with a warning where that failed, and the files."""
-    warnings = list(retrained.decision.warnings) if retrained.decision else []
+    warnings = list(retrained.warnings)
     files: tuple[str, ...] = ()
     try:
         files = tuple(map(str, write_report(retrained)))
@@ -62,8 +62,7 @@ def _sections(retrained: Retrained) -> Iterator[str]:
                    for name, unit in zip(states.names, states.units, strict=True))
     kind = '' if learned is None else f' ({learned.model.kind})'
     yield f'**The new model{kind} is {"accepted" if retrained.accepted else "rejected"}.**'
-    warnings = () if decision is None else decision.warnings
-    yield bullets([*retrained.reasons, *(f'Warning: {warning}.' for warning in warnings)])
+    yield bullets([*retrained.reasons, *(f'Warning: {one}.' for one in retrained.warnings)])
     if retrained.model_file:
         yield f'Model file: `{retrained.model_file}`'
     if retrained.alternative_files:

@@ -51,6 +51,11 @@ class Retrained:
     __repr__ = short_repr
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should know of the record and of the model, in either case."""
+        return (*self.account.warnings(), *(self.decision.warnings if self.decision else ()))
+
+    @property
     def accepted(self) -> bool:
         """Whether the lift may be used."""
         return not self.reasons
@@ -98,7 +103,7 @@ class Retrained:
             'accepted': self.accepted,
             'model_class': 'none learned' if self.learned is None else self.learned.chosen.name,
             'reasons': list(self.reasons),
-            'warnings': list(self.decision.warnings) if self.decision else [],
+            'warnings': list(self.warnings),
             'model_file': self.model_file,
             'alternative_files': list(self.alternative_files),
             'units': dict(zip((*states.names, *inputs.names), (*states.units, *inputs.units),

@@ -3,38 +3,28 @@
 
 """A loop's measurements with the input that acted on them, cut from bags into episodes."""
 
-from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 import math
 import os
 
 import numpy as np
-from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.datasets import Episode
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import Conversion, conversion, NANOSECONDS
 from koopman_ros.records import applied_inputs, segments
-from koopman_ros.records.align import align_by_timestamp, AlignedSamples, named
+from koopman_ros.records.align import align_by_timestamp, AlignedSamples
 from koopman_ros.records.applied_inputs import Applied
+from koopman_ros.records.cutter import EpisodeCutter
 from koopman_ros.records.decoding import BagMessage
-from koopman_ros.records.import_spec import (
-    break_notes,
-    ImportReport,
-    places_of,
-    RecordedInput,
-    RecordedState,
-)
+from koopman_ros.records.import_spec import ImportReport, places_of, RecordedInput, RecordedState
 from koopman_ros.records.mcap_file import BagReadError
 from koopman_ros.records.reader import BagSummary, read_messages, summary
 from koopman_ros.records.segments import Clock, NO_STAMP, Segment, Times
-from koopman_ros.records.series import check_places, outliers_and_steps, stamped_number
+from koopman_ros.records.series import check_places, stamped_number
 
-# A gap is longer than this many usual periods.
-GAP_PERIODS = 3.5
-SHORTEST = 10
 # An input without commands that mostly keeps its value from sample to sample moves in steps.
 _AT_REST = 0.5
 _CHECKED = 1000  # messages between two looks for a complete portion
@@ -77,8 +67,8 @@ def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Rec
     receipts. A command without a stamp acts when it is received.
 
     Episodes end at gaps, where time is set back, and where a state jumps to another level as after
-    a reset. Spikes of a single sample are dropped, and so are measurements before the first input,
-    because the applied input is unknown before. A bag that was not closed or is damaged is read as
+    a reset. Spikes are dropped, and so are measurements before the first input, because the
+    applied input is unknown before. A bag that was not closed or is damaged is read as
     far as it goes. The account lists all of that.
 
     Memory does not grow with the bags: of a long record some ten thousand measurements are
@@ -93,12 +83,10 @@ def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Rec
     """
     for bag in distinct(bags, account):
         imported = _BagImport(os.fspath(bag), states, inputs, account, tolerance_ns,
-                              least_jumps or [0.0] * len(states))
+                              least_jumps or ())
         for segment in imported.segments():
-            for episode in imported.episodes(segment):
-                account.used += len(states) * len(episode)
-                yield episode
-        account.notes += break_notes(imported.bag, imported.breaks)
+            yield from imported.episodes(segment)
+        imported.cutter.note_breaks()
     account.dropped = +account.dropped
 
 
@@ -124,11 +112,11 @@ class _BagImport:
     account: ImportReport
     tolerance_ns: int
     least_jumps: Sequence[float]
-    #: ends of episodes by reason: amount, and this in words
-    breaks: defaultdict[str, list[tuple[float, str]]] = field(
-        default_factory=lambda: defaultdict(list))
 
     def __post_init__(self) -> None:
+        self.cutter = EpisodeCutter(
+            self.bag, [state.name for state in self.states], [one.unit for one in self.states],
+            self.account, NANOSECONDS, self.least_jumps)
         self.content: BagSummary = summary(self.bag)
         self.inputs = [self._without_missing(signal) for signal in self.inputs]
         #: conversions to the units of the signals, by place, those of the states first
@@ -182,7 +170,7 @@ class _BagImport:
                 stamp_ns, value = accepted
                 if back_ns := segment.set_back(number, stamp_ns):
                     back = back_ns / NANOSECONDS
-                    self.breaks['set back'].append((back, f'{back:.3f} s'))
+                    self.cutter.breaks['set back'].append((back, f'{back:.3f} s'))
                     yield segment
                     segment = Segment(places, n_x)
                 segment.add(number, stamp_ns, message.log_time_ns, value)
@@ -230,78 +218,25 @@ class _BagImport:
     def episodes(self, segment: Segment) -> Iterator[Episode]:
         """Align one segment and cut it at its gaps and jumps."""
         self._check_pace(segment)
-        dropped, n_x = self.account.dropped, len(self.states)
         clock = segment.clock()
-        samples = align_by_timestamp(segment, clock, self.states, self.tolerance_ns, dropped)
-        stamps, x = samples.stamps, samples.x
-        has_inputs = all(any(len(segment.of(place)) or place in segment.applied
-                             for place in places_of(signal)) for signal in self.inputs)
-        if len(stamps) < SHORTEST or not has_inputs:
-            dropped['too short, or without any input'] += x.size
+        samples = align_by_timestamp(segment, clock, self.states, self.tolerance_ns,
+                                     self.account.dropped)
+        x = np.column_stack([self.scales[signal.place](samples.x[:, j])
+                             for j, signal in enumerate(self.states)])
+        if not all(any(len(segment.of(place)) or place in segment.applied
+                       for place in places_of(signal)) for signal in self.inputs):
+            self.cutter.drop('without any input', x)
             return
-        spike = self._leaps(x)[0]
-        spiked = spike.any(axis=1)
-        for state, count in zip(self.states, spike.sum(axis=0).tolist(), strict=True):
-            dropped[named(self.states, state, 'spike of a single sample')] += count
-        dropped['in a sample with a spike'] += n_x * int(np.sum(spiked)) - int(np.sum(spike))
-        stamps, x = stamps[~spiked], x[~spiked]
-        period = float(np.median(np.diff(stamps)))
-        ends = self._ends(stamps, x, period)
-        recorded = [(self._commands(segment, signal, samples, clock, period),
-                     self._measured(segment, signal, clock)) for signal in self.inputs]
-        for rows in np.split(np.arange(len(stamps)), ends):
-            times = stamps[rows]
-            applied = [self._applied(signal.name, *both, times, period)
-                       for signal, both in zip(self.inputs, recorded, strict=True)]
-            started = times >= max(start for start, _ in map(applied_inputs.span, applied))
-            within = times <= min(end for _, end in map(applied_inputs.span, applied))
-            dropped['before the first input'] += n_x * int(np.sum(~started))
-            dropped['after the last input'] += n_x * int(np.sum(~within))
-            rows = rows[started & within]
-            if len(rows) < SHORTEST:
-                dropped[f'in a segment of fewer than {SHORTEST}'] += n_x * len(rows)
-                continue
-            yield self._episode(stamps[rows], x[rows], applied)
+        recorded: list[tuple[tuple[Times, Array], tuple[Times, Array]]] = []
 
-    def _ends(self, stamps: Times, x: Array, period: float) -> NDArray[np.int64]:
-        """Return where episodes end, at gaps and jumps, and note these."""
-        jump = self._leaps(x)[1]
-        gap = np.diff(stamps, prepend=stamps[0]) > GAP_PERIODS * period
-        ends = np.flatnonzero(gap | jump.any(axis=1))
-        for end in ends.tolist():
-            at = f'at {stamps[end - 1] / NANOSECONDS:.3f} s'
-            if gap[end]:
-                seconds = (stamps[end] - stamps[end - 1]) / NANOSECONDS
-                self.breaks['gap'].append((seconds, f'{seconds:.3f} s {at}'))
-            else:
-                j = int(np.argmax(jump[end]))
-                state = self.states[j]
-                level = named(self.states, state, f'{x[end, j]:.6g} {state.place.unit}')
-                self.breaks['jump'].append((float(x[end, j]), f'{level} {at}'))
-        return ends
+        def inputs(times: Times, period: float) -> list[Applied]:
+            if not recorded:
+                recorded.extend((self._commands(segment, signal, samples, clock, period),
+                                 self._measured(segment, signal, clock)) for signal in self.inputs)
+            return [self._applied(signal.name, *both, times, period)
+                    for signal, both in zip(self.inputs, recorded, strict=True)]
 
-    def _episode(self, stamps: Times, x: Array, applied: Sequence[Applied]) -> Episode:
-        """Return measurements with their applied inputs, in the signals' units."""
-        origin = stamps[0]
-        changes = np.unique(np.concatenate([times for times, _, _ in applied]))
-        changes = changes[changes >= max(times[0] for times, _, _ in applied)]
-        u = np.column_stack([
-            np.interp(changes - origin, times - origin, values) if linear
-            else values[np.searchsorted(times, changes, side='right') - 1]
-            for times, values, linear in applied])
-        scaled = [self.scales[signal.place](x[:, j]) for j, signal in enumerate(self.states)]
-        linear = tuple(linear for _, _, linear in applied)
-        return Episode((stamps - origin) / NANOSECONDS, np.column_stack(scaled),
-                       (changes - origin) / NANOSECONDS, u,
-                       linear if any(linear) else ()).part(0, len(stamps))
-
-    def _leaps(self, x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return where each state (N, n_x) has a spike, and where it jumps."""
-        found = [outliers_and_steps(x[:, j], least / self.scales[signal.place].factor)
-                 for j, (signal, least) in enumerate(
-                     zip(self.states, self.least_jumps, strict=True))]
-        spikes, jumps = zip(*found, strict=True)
-        return np.column_stack(spikes), np.column_stack(jumps)
+        yield from self.cutter.cut(samples.stamps, x, inputs)
 
     def _commands(self, segment: Segment, signal: RecordedInput, samples: AlignedSamples,
                   clock: Clock, period: float) -> tuple[Times, Array]:
@@ -335,7 +270,7 @@ class _BagImport:
                  stamps: Times, period: float) -> Applied:
         """Return the applied input over the time of some measurements."""
         usual = float(np.median(np.diff(measured[0]))) if len(measured[0]) > 1 else 0.0
-        reach = GAP_PERIODS * max(period, usual)
+        reach = self.cutter.rules.gap_periods * max(period, usual)
         near = (measured[0] >= stamps[0] - reach) & (measured[0] <= stamps[-1] + reach)
         times, values = measured[0][near], measured[1][near]
         if (len(times) < 2 or times[0] > stamps[0] + reach or times[-1] < stamps[-1] - reach

@@ -40,9 +40,11 @@ class RecordedInput:
 class ImportReport:
     """The result of an import in numbers and notes."""
 
-    measurements: int = 0  #: number of measurements read, of all states
+    measurements: int = 0  #: number of values read, of all states
     used: int = 0  #: number of those in an episode
-    dropped: Counter[str] = field(default_factory=Counter)  #: messages left out, by reason
+    dropped: Counter[str] = field(default_factory=Counter)  #: values left out, by reason
+    spikes: Counter[str] = field(default_factory=Counter)  #: those that are spikes, by state
+    checked: Counter[str] = field(default_factory=Counter)  #: values searched for spikes, by state
     notes: list[str] = field(default_factory=list)  #: anything else, in sentences
 
     def note(self, text: str) -> None:
@@ -55,13 +57,21 @@ class ImportReport:
         self.measurements += other.measurements
         self.used += other.used
         self.dropped += other.dropped
+        self.spikes += other.spikes
+        self.checked += other.checked
         self.notes += other.notes
+
+    def warnings(self, most: float = 0.02) -> list[str]:
+        """Return a warning for each state with more than a share of spikes."""
+        return [f'{count} of {self.checked[name]} values of {name} are spikes, which were left '
+                'out: check the sensor and its wiring, or filter the record'
+                for name, count in self.spikes.items() if count > most * self.checked[name]]
 
     def lines(self) -> list[str]:
         """Return the account in words."""
-        return [f'{self.used} of {self.measurements} measurements used',
-                *(f'{count} dropped: {why}' for why, count in sorted(self.dropped.items())),
-                *self.notes]
+        return [f'{self.used} of {self.measurements} values used',
+                *(f'{count} dropped: {why}' for why, count in sorted(self.dropped.items())
+                  if count), *self.notes, *(f'warning: {one}' for one in self.warnings())]
 
 
 def places_of(signal: RecordedState | RecordedInput) -> list[MessageField]:

@@ -19,15 +19,8 @@ from koopman_ros.core.message_fields import base_name, place
 from koopman_ros.core.units import check_unit, NANOSECONDS
 from koopman_ros.records.episodes import loop_episodes
 from koopman_ros.records.import_spec import ImportReport, RecordedInput, RecordedState
-from koopman_ros.records.tables import (
-    conversion_of,
-    seconds_of,
-    SignalColumn,
-    Source,
-    table_of,
-    TableImport,
-    with_unit,
-)
+from koopman_ros.records.table_import import conversion_of, import_table
+from koopman_ros.records.tables import SignalColumn, Source, table_of
 
 #: Names of signals: ``'level'``, ``'level [m]'``, ``'level = LT101.PV [m]'``.
 Names: TypeAlias = str | Sequence[str]
@@ -82,12 +75,13 @@ class Record:
         signals = ', '.join(f'{name} [{unit}]' for name, unit in zip(
             (*about.state_names, *about.input_names), (*about.state_units, *about.input_units),
             strict=True))
-        lengths = [f'{len(one)} measurements in {one.time[-1]:.6g} s' for one in self.episodes]
+        lengths = [f'{len(one)} samples in {one.time[-1]:.6g} s' for one in self.episodes]
         return '\n  '.join([signals, *lengths, *self.report.lines()])
 
 
 def read(source: Source, states: Names, inputs: Names, *, time: str = '', period: float = 0.0,
-         linear: Names = (), tolerance: float = 0.0, name: str = '') -> Record:
+         linear: Names = (), tolerance: float = 0.0, name: str = '',
+         dayfirst: bool | None = None) -> Record:
     """
     Read a record of a plant from tables or bags.
 
@@ -100,22 +94,25 @@ def read(source: Source, states: Names, inputs: Names, *, time: str = '', period
     has the unit 1. A cell without a number is a missing measurement of that signal alone: NaN in
     the episodes, so that a signal from the laboratory counts at its own times. An input without a
     number keeps its last value. A new episode begins at a gap of 3.5 usual periods, where time is
-    set back, and where a state jumps as after a reset; spikes of a single sample are dropped.
+    set back, and where a state jumps as after a reset; spikes are dropped.
 
-    :param source: a .csv, .parquet or .mat file, a bag, a DataFrame, columns by name, or a list
-        of them. Columns of a two-dimensional array y of a .mat file are y_1, y_2 and so on.
+    :param source: a text table (.csv, .txt, .tsv, .dat, .lvm), a .parquet or .mat file, a bag, a
+        DataFrame, columns by name, or a list of them. Columns of a two-dimensional array y of a
+        .mat file are y_1, y_2 and so on.
     :param states: measured signals, ``name``, ``name [unit]`` or ``name = column [unit]``.
     :param inputs: inputs that acted from the time of their row on. In a bag, an input is its
         commands and its measurements, on the usual topics of its name.
     :param time: column of the time, by default ``time`` or an index of dates. Dates and durations
-        are recognised; numbers are seconds, or of the unit in brackets: ns, us, ms, s, min, h, d.
+        are recognised; numbers are seconds, since 1970 too, or of the unit in the header or below:
+        ns, us, ms, s, min, h, d.
     :param period: time between rows in s, in place of a column.
     :param linear: inputs that are linear from row to row, such as measurements of a slow actuator.
     :param tolerance: largest difference in s between the stamps of one sample in a bag.
     :param name: of the plant; by default that of the first file.
+    :param dayfirst: whether 1/2/2026 is 1 February, where no date of the column tells.
     :raises BagReadError: for a bag that cannot be read.
-    :raises ValueError: for a table without such a column, with times that cannot be in seconds, or
-        of another kind.
+    :raises ValueError: for a table that cannot be read, or whose times or numbers have more than
+        one reading, with row, column and cell.
     :raises TypeError: for names that are a table, where the arguments are in another order.
     """
     sources = source if isinstance(source, list | tuple) else [source]
@@ -133,12 +130,13 @@ def read(source: Source, states: Names, inputs: Names, *, time: str = '', period
             report.add(own)
             episodes += found
             continue
-        table = table_of(one)
-        of_states, of_inputs = (tuple(with_unit(table, signal, report) for signal in some)
+        table = table_of(one, label).with_tags(
+            signal.column for signal in (*of_states, *of_inputs))
+        of_states, of_inputs = (tuple(signal.with_unit_in(table, report) for signal in some)
                                 for some in (of_states, of_inputs))
-        episodes += TableImport(
-            label, of_states, of_inputs, _names(linear, 'linear'), report).episodes(
-            table, seconds_of(table, time, period))
+        episodes += import_table(table, table.seconds(time, period, dayfirst, report.note),
+                                 of_states, of_inputs, _names(linear, 'linear'), report)
+    report.dropped = +report.dropped
     files = tuple(os.fspath(one) for one in sources if isinstance(one, str | os.PathLike))
     if not episodes:
         raise ValueError('the record holds no usable segment of measurements: '

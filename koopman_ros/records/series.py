@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Recorded signals: a number in each message of a topic, and where they jump."""
+"""Recorded signals: a number in each message of a topic."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -17,14 +17,6 @@ from koopman_ros.records.mcap_file import BagReadError, reason
 from koopman_ros.records.reader import BagSummary, read_messages, summary
 
 _MOST_NS = 2**63
-# Fewer samples do not show the usual interval.
-_ENOUGH = 50
-# A change is no motion when it is larger than so many times all but the largest changes, ...
-_TIMES_USUAL = 10.0
-_USUAL = 90.0  # percentile
-# ... and than this share of the range in which it mostly is.
-_SHARE_OF_RANGE = 0.2
-_MOSTLY = (1.0, 99.0)  # percentiles
 
 
 @dataclass(frozen=True)
@@ -99,27 +91,3 @@ def stamped_number(path: str | os.PathLike[str], entry: BagMessage, place: Messa
 def _other_type(path: str | os.PathLike[str], topic: str, found: str, wanted: str) -> BagReadError:
     return BagReadError(f'topic {topic!r} of bag {os.fspath(path)!r} is {found}, not {wanted}: '
                         'name another topic, or its type')
-
-
-def outliers_and_steps(values: NDArray[np.float64], least: float = 0.0
-                     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """
-    Find changes that no plant makes: samples that leap away and back, and jumps to another level.
-
-    :param values: (n,) in the order of their times.
-    :param least: no smaller change is one of them.
-    :return: whether each sample is a spike (n,), and whether the signal jumps to it (n,).
-    """
-    spike, jump = np.zeros(len(values), dtype=bool), np.zeros(len(values), dtype=bool)
-    if len(values) < _ENOUGH:
-        return spike, jump
-    change = np.diff(values)
-    low, high = np.percentile(values, _MOSTLY)
-    limit = max(_TIMES_USUAL * float(np.percentile(np.abs(change), _USUAL)),
-                _SHARE_OF_RANGE * float(high - low), least)
-    large = np.abs(change) > limit
-    spike[1:-1] = large[:-1] & large[1:] & (
-        np.signbit(change[:-1]) != np.signbit(change[1:]))
-    # two changes belong to each spike
-    jump[1:] = large & ~spike[1:] & ~spike[:-1]
-    return spike, jump

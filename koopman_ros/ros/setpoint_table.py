@@ -18,7 +18,7 @@ from koopman_ros.parameters.player import PlayerParameters
 from koopman_ros.parameters.signal_topics import SignalTopics
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.records import BagMessage, BagSummary
-from koopman_ros.records.tables import header_of, seconds_of, table_of
+from koopman_ros.records.tables import table_of
 from koopman_ros.ros.time_conversion import stamp_message
 from koopman_ros.ros.topics import message_class
 
@@ -42,14 +42,14 @@ class SetpointTable:
                 f'system = {settings.system!r} has no set-points: name a plant of config/plants')
         try:
             table = table_of(settings.bag)
-            times = seconds_of(table, '', 0.0)
+            times = table.seconds('', 0.0, None)
             trajectories = {}
             for name, place in wiring.setpoints.items():
-                if (found := header_of(table, name)) is None:
+                if (column := table.find(name)) is None:
                     continue
-                column, unit = found
-                convert = conversion(unit or display_unit(wiring.signals.states[name]), place.unit)
-                values = np.array(table[column], dtype=np.float64)
+                convert = conversion(table.unit(column) or display_unit(
+                    wiring.signals.states[name]), place.unit)
+                values = table.numbers(column)
                 given = np.isfinite(times) & np.isfinite(values)
                 trajectories[name] = _trajectory(times[given], np.array(
                     [convert(value) for value in values[given].tolist()]), settings)

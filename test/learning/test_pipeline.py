@@ -151,7 +151,7 @@ def test_report_without_matplotlib(accepted, monkeypatch):
     gain = figures['input_gain']['temperature']['coolant_temperature']
     assert 60.0 * gain == pytest.approx(0.8 * 2.0921, rel=0.02)
     page = files[1].read_text()
-    for words in ('is accepted.**', '1201 of 1201 measurements used', said,
+    for words in ('is accepted.**', '1201 of 1201 values used', said,
                   '| operating point | eigenvalues |',
                   f'| the current model | {retrained.decision.current_rmse[0]:.5g} |'):
         assert words in page
@@ -271,7 +271,7 @@ def test_a_task_survives_json():
     ({'output': 'file/new.safetensors'}, OSError, 'file'),
     ({'bags': ('/nowhere/run.mcap',)}, BagReadError, '/nowhere/run.mcap'),
     ({'bags': ('short.mcap',)}, ValueError, 'no usable segment of measurements: 0 of 9 '
-     'measurements used; 9 dropped: too short'),
+     'values used; 9 dropped: in a segment'),
     ({'states': (replace(STATES[0], place=replace(STATES[0].place, topic='/other')),)},
      BagReadError, "has no topic '/other'"),
     ({'margin': 2.0}, ValueError, 'margin = 2.0'),

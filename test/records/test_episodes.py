@@ -16,7 +16,7 @@ from koopman_ros import records
 from koopman_ros.core.datasets import Episode
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.plants import one_state_reactor, random_steps, RandomStepDesign
-from koopman_ros.records.series import outliers_and_steps
+from koopman_ros.records.cutter import spikes_and_jumps
 from support.bag_samples import noted, PRESSURE, Sample, Sent, TEMPERATURE, WALL
 
 MEASURED, COMMAND = '/level', '/valve'
@@ -62,7 +62,7 @@ def answers(first: int, last: int, later: float = 0.0) -> list[tuple[float, floa
 
 
 SPIKE_AND_JUMP = {k: 5000.0 if k == 40 else 3000.0 * (k > 70) for k in range(1, 121)}
-NO_INPUT = 'too short, or without any input'
+SHORT = 'in a segment of fewer than 10'
 
 
 @pytest.mark.parametrize(('messages', 'values', 'acting', 'dropped', 'note'), [
@@ -95,7 +95,7 @@ NO_INPUT = 'too short, or without any input'
                   for s in loop(120)],
                  [[*range(1, 40), *range(41, 71)], range(3071, 3121)],
                  [answers(1, 70), answers(71, 120, 3000.0)],
-                 {'spike of a single sample': 1}, ('jump', '3071 Pa', '70.000 s'),
+                 {'spike (level)': 1}, ('jump', '3071 Pa', '70.000 s'),
                  id='spike and jump'),
     pytest.param([*loop(30), *(Sent(s.topic, s.stamp, s.value + 500.0, s.received + 100.0)
                                for s in loop(12))],
@@ -112,12 +112,12 @@ NO_INPUT = 'too short, or without any input'
                  {'before the first input': 15}, (), id='measurements before the first command'),
     pytest.param([], [], [], {}, (), id='nothing'),
     pytest.param(measured(*range(1, 21)), [], [],
-                 {NO_INPUT: 20}, (), id='no command'),
-    pytest.param(loop(9), [], [], {NO_INPUT: 9}, (), id='too short'),
+                 {'without any input': 20}, (), id='no command'),
+    pytest.param(loop(9), [], [], {SHORT: 9}, (), id='too short'),
     pytest.param([s for s in loop(20) if s.topic == COMMAND], [], [],
                  {}, (), id='no measurement'),
     pytest.param([Sent(s.topic, 0.0, s.value, s.stamp) for s in loop(20)], [], [],
-                 {NO_INPUT: 1, 'measurement with a repeated stamp': 19}, (),
+                 {SHORT: 1, 'measurement with a repeated stamp': 19}, (),
                  id='a sensor that does not stamp'),
 ])
 def test_episodes_of_a_bag(
@@ -211,7 +211,7 @@ def test_each_of_several_bags_is_read_once(write: Callable[..., Path], tmp_path:
     (tmp_path / 'link.mcap').symlink_to(bags[0])
     (first, second), account = read(*bags, tmp_path / 'link.mcap')
     assert (len(first), len(second)) == (15, 12)
-    assert account.lines()[0] == '27 of 27 measurements used'
+    assert account.lines()[0] == '27 of 27 values used'
     assert noted(account, 'link.mcap', 'twice')
 
 
@@ -317,7 +317,7 @@ def motion() -> np.ndarray:
 
 def found(values: np.ndarray) -> list[list[int]]:
     """Return where there are spikes, and where jumps."""
-    return [np.flatnonzero(kind).tolist() for kind in outliers_and_steps(values, 1.0)]
+    return [np.flatnonzero(kind).tolist() for kind in spikes_and_jumps(values, 1.0)]
 
 
 @pytest.mark.parametrize('noise', [0.0, 0.1, 1.0])
@@ -346,3 +346,40 @@ def test_spikes_and_jumps_are_found(motion: np.ndarray, noise: float) -> None:
     (np.r_[np.zeros(20), 100.0, np.zeros(20)], [])])
 def test_jumps_after_a_rest(values: np.ndarray, jumps: list[int]) -> None:
     assert found(values) == [[], jumps]
+
+
+@pytest.mark.parametrize('share', [0.01, 0.055, 0.1, 0.2])
+def test_spikes_are_found_whatever_their_share(share: float) -> None:
+    rng = np.random.default_rng(5)
+    values = 50.0 + 20.0 * np.sin(np.arange(600) / 30.0)
+    spiked = np.sort(rng.choice(np.arange(3, 597), round(600 * share), replace=False))
+    values[spiked] += rng.choice([60.0, 45.0], len(spiked))
+    spikes, jumps = found(values)
+    assert len(np.setxor1d(spikes, spiked)) <= 0.01 * len(spiked) + 0.04 * 600 * share * (
+        share > 0.1)
+    assert share > 0.1 or jumps == []
+
+
+@pytest.mark.parametrize('step', [0.5, 1.0])
+def test_a_coarse_sensor_neither_jumps_nor_has_spikes(step: float) -> None:
+    # a slow room within 3 K
+    rng = np.random.default_rng(1)
+    heater, values = np.repeat(rng.uniform(19.0, 23.0, 12), 240), [20.0]
+    for goal in heater[:-1]:
+        values.append(values[-1] + (goal - values[-1]) / 120.0)
+    coarse = step * np.round(np.array(values) / step)
+    assert [np.flatnonzero(kind).tolist() for kind in spikes_and_jumps(coarse)] == [[], []]
+    coarse[[500, 1500]] += 40.0
+    coarse[2000:] += 30.0
+    assert [np.flatnonzero(kind).tolist() for kind in spikes_and_jumps(coarse)] == [
+        [500, 1500], [2000]]
+
+
+def test_many_spikes_are_a_warning() -> None:
+    level = 50.0 + 20.0 * np.sin(np.arange(600) / 30.0)
+    for count, warned in ((6, False), (30, True)):
+        spiked = level.copy()
+        spiked[5::600 // count] += 60.0
+        record = records.read({'level': spiked, 'valve': level}, 'level', 'valve', period=1.0)
+        assert record.report.dropped == {'spike (level)': count}
+        assert bool(record.report.warnings()) == warned == ('warning' in str(record))

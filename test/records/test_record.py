@@ -3,6 +3,7 @@
 
 """Records from tables: columns, units, times, missing values and gaps."""
 
+import os
 from pathlib import Path
 import re
 
@@ -65,6 +66,7 @@ def test_each_kind_of_file_gives_the_same_episode(tmp_path, write):
     ('time [ms]', (1000 * SECONDS).astype(np.int64)),
     ('time [d]', SECONDS / 86400.0),
     ('time [ns]', (1e9 * SECONDS).astype(np.int64)),
+    ('stamp', 1_772_352_000_123 + (1e3 * SECONDS).astype(np.int64)),
     ('stamp', 1_772_352_000_123_456_789 + (1e9 * SECONDS).astype(np.int64)),
     ('stamp', START + pd.to_timedelta(SECONDS, 's')),
     ('stamp', (START.tz_localize('Europe/Berlin') + pd.to_timedelta(SECONDS, 's'))),
@@ -98,7 +100,11 @@ def test_times_may_be_a_period_a_unit_of_the_argument_or_an_index(options):
 @pytest.mark.parametrize(('columns', 'options', 'words'), [
     ({'time': (1e9 * SECONDS).astype(np.int64)}, {}, r"cannot be seconds: .*time='time \[ns\]'"),
     ({'time': 1e9 * SECONDS}, {}, 'cannot be seconds'),
-    ({'time': 1_772_352_000_123 + 500 * np.arange(N)}, {}, 'cannot be seconds'),
+    ({'time': SECONDS, 'level [m]': LEVEL + 0j}, {}, 'complex'),
+    ({'time': SECONDS}, {'period': np.nan}, 'finite'),
+    ({'time': SECONDS}, {'period': np.inf}, 'finite'),
+    ({'time': SECONDS, 'level [m]': [10 ** 400] * N}, {}, 'row 1, .*308 digits'),
+    ({'time': SECONDS, 'level [cm]': LEVEL}, {}, '2 columns are called'),
     ({}, {}, "no column 'time'.*or give the period of the rows in s"),
     ({'time': SECONDS}, {'time': 'hour'}, "no column 'hour'"),
     ({'time': SECONDS}, {'time': 'time', 'period': 1.0}, 'give one'),
@@ -130,9 +136,11 @@ def test_a_row_of_units_below_the_header_and_late_decimal_commas_are_understood(
 @pytest.mark.parametrize(('text', 'words'), [
     ('time;level [°C];pump\n0;1;2\n', 'day.csv .*UTF-8'),
     ('time,level,pump\n' + '0,1,5,2,5\n' * N, 'as many cells'),
-    ('# logger\ntime,level,pump\n0,1,2\n', 'one row of headers'),
-    ('', 'one row of headers'),
-    ('time,level,pump\n' + '1,"0,5",2\n' * N, "but e.g. '0,5': write numbers as 1.5"),
+    ('', 'no row of headers'),
+    ('time,level,pump\n' + '1,"0.5 m",2\n' * N, "row 2, column 'level': '0.5 m'"),
+    ('time,level,pump\n' + '1,0.5,2\n' * N + '2,0.5\n3,1,2\n', 'line 62 has 2 cells'),
+    ('time,level,pump\n' + '1,0.5,2\n' * 300 + '1,' + '9' * 5_000_000 + ',2\n', 'field'),
+    ('x' * 5_000_000, 'line 1 has more than'),
 ])
 def test_a_file_that_is_no_table_is_named_with_the_next_step(tmp_path, text, words):
     (tmp_path / 'day.csv').write_text(text, encoding='latin-1')
@@ -193,7 +201,7 @@ def test_signals_with_rows_of_their_own_share_their_times():
     (lambda t, x: t.__setitem__(slice(30, None), t[30:] + 60.0), 'gap of 60.500 s', [30, 30]),
     (lambda t, x: t.__setitem__(slice(30, None), t[30:] - 60.0), 'set back by 59.500', [30, 30]),
     (lambda t, x: x.__setitem__(slice(30, None), x[30:] + 9.0), r'jump to 9\.\d+ 1', [30, 30]),
-    (lambda t, x: x.__setitem__(30, 9.0), r'1 dropped: spike of a single sample \(level\)', [59]),
+    (lambda t, x: x.__setitem__(30, 9.0), r'1 dropped: spike \(level\)', [59]),
     (lambda t, x: t.__setitem__(slice(55, None), t[55:] + 60.0), '5 dropped: in a segment', [55]),
     (lambda t, x: t.__setitem__(2, np.nan), '1 dropped: without a time', [59]),
 ])
@@ -244,11 +252,41 @@ def test_a_table_in_the_place_of_names_is_rejected(arguments, words):
         read(*arguments)
 
 
-@pytest.mark.parametrize('file', ['notes.txt', 'old.mat'])
+@pytest.mark.parametrize('file', ['notes.doc', 'old.mat'])
 def test_rejects_other_files(tmp_path, file):
     (tmp_path / file).write_bytes(b'MATLAB 7.3 MAT-file'.ljust(124) + b'\x00\x02IM')
     with pytest.raises(ValueError, match=r'is not a record|version 7\.3'):
         read(tmp_path / file, 'level', 'pump')
+
+
+@pytest.mark.parametrize('kind', ['csv', 'parquet', 'mat', 'mcap', 'txt'])
+def test_pipes_and_devices_are_rejected_without_reading_them(tmp_path, kind):
+    os.mkfifo(tmp_path / f'pipe.{kind}')
+    (tmp_path / f'zeros.{kind}').symlink_to('/dev/zero')
+    for path in tmp_path.iterdir():
+        with pytest.raises(ValueError, match=path.name):
+            read(path, 'level [m]', 'pump [V]')
+
+
+def test_a_period_beside_a_column_of_times_is_a_notice():
+    record = read(frame(time=SECONDS), 'level', 'pump', period=2.0)
+    assert record.episodes[0].time[1] == 2.0
+    assert any("'time' are not used" in note and 'period = 2' in note
+               for note in record.report.notes)
+
+
+@pytest.mark.parametrize(('dayfirst', 'step'), [
+    (None, None), (True, 86400.0), (False, 31 * 86400.0)])
+def test_days_and_months_that_no_date_tells_are_asked_for(dayfirst, step):
+    dates = [f'0{1 + k // 12}/03/2026 {k % 12:02d}:00' for k in range(24)]
+    if dayfirst is None:
+        with pytest.raises(ValueError, match='dayfirst=True or dayfirst=False'):
+            read({'time': dates, 'level': LEVEL[:24], 'pump': PUMP[:24]}, 'level', 'pump')
+        return
+    record = read({'time': dates, 'level': LEVEL[:24], 'pump': PUMP[:24]}, 'level', 'pump',
+                  dayfirst=dayfirst)
+    gap = step - 11 * 3600.0
+    assert f'gap of {gap:.3f} s' in str(record)
 
 
 @pytest.mark.skipif(not RECORDS.is_dir(), reason='the measured records are not here')
