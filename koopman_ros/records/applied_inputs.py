@@ -4,8 +4,10 @@
 """The applied input, from its commands or from measurements behind its actuator."""
 
 import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.records.segments import Clock, Entries, Times
@@ -16,8 +18,8 @@ _NO_DELAY = 0.01
 # without delay: the command tells better when it changed.
 _FOLLOWS = 0.02
 
-# (M,) times in ns, (M,) values in the input's unit, whether it is linear between them
-Applied = tuple[Times, Array, bool]
+# (M,) times, (M,) values in the input's unit, whether it is linear between them
+Applied = tuple[NDArray[Any], Array, bool]
 
 
 def commanded(entries: Entries, clock: Clock, received: tuple[Times, Times], period: float

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,8 +119,8 @@ class EpisodeCutter:
     breaks: defaultdict[str, list[tuple[float, str]]] = field(
         default_factory=lambda: defaultdict(list))
 
-    def cut(self, times: NDArray[np.generic], x: Array,
-            inputs: Callable[[NDArray[np.generic], float], Sequence[Applied]]
+    def cut(self, times: NDArray[Any], x: Array,
+            inputs: Callable[[NDArray[Any], float], Sequence[Applied]]
             ) -> Iterator[Episode]:
         """
         Yield the episodes of measurements between two resets of time.
@@ -166,7 +167,7 @@ class EpisodeCutter:
             jumps[rows[jump]] = j
         return x, jumps
 
-    def _ends(self, times: NDArray[np.generic], x: Array, jumps: NDArray[np.int64], period: float
+    def _ends(self, times: NDArray[Any], x: Array, jumps: NDArray[np.int64], period: float
               ) -> NDArray[np.int64]:
         """Return where episodes begin, after gaps and at jumps, and note these."""
         step = np.diff(times, prepend=times[:1])
@@ -184,7 +185,7 @@ class EpisodeCutter:
                 self.breaks['jump'].append((abs(float(x[end, j])), f'{level} {at}'))
         return ends
 
-    def _episode(self, times: NDArray[np.generic], x: Array, applied: Sequence[Applied]
+    def _episode(self, times: NDArray[Any], x: Array, applied: Sequence[Applied]
                  ) -> Episode:
         origin = times[0]
         changes = np.unique(np.concatenate([own for own, _, _ in applied]))

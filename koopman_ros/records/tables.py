@@ -175,8 +175,8 @@ class Table:
         if not lacking:
             return self
         for tag in self.frame.columns:
-            cells = np.array(self.cells(tag) or [''])
-            if set(lacking) <= set(cells.tolist()):
+            names = self.cells(tag) or []
+            if set(lacking) <= set(names):
                 break
         else:
             tag = -1
@@ -199,7 +199,7 @@ class Table:
         series = [k for k, header in enumerate(self.headers) if header == 'table']
         frame = self.frame.copy()
         for number, column in enumerate(lacking, len(self.headers)):
-            own = cells == column
+            own = np.array(names) == column
             if several := [k for k in series if self.frame[k][own].nunique() > 1]:
                 raise ValueError(f'{self.label} has several series of {column!r}, numbered in '
                                  f'{self.headers[several[0]]!r}: keep the rows of one')

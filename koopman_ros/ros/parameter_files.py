@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
-import yaml
+from koopman_ros.core.yaml_text import load_yaml
 
 
 def ignored_sections(arguments: Sequence[str], program: str, full_name: str) -> list[str]:
@@ -35,8 +35,8 @@ def ignored_sections(arguments: Sequence[str], program: str, full_name: str) -> 
 
 def _sections(file: str) -> list[str]:
     try:
-        content = yaml.safe_load(Path(file).read_text())
-    except (OSError, ValueError, yaml.YAMLError):
+        content = load_yaml(Path(file).read_text())
+    except (OSError, ValueError):
         # ROS has read it, or says why not
         return []
     return [str(section) for section in content] if isinstance(content, dict) else []
