@@ -30,7 +30,15 @@ from koopman_ros.panel.faceplates import Range
 from koopman_ros.panel.files import sanitize_text
 from koopman_ros.panel.learning_watch import LearningWatch
 from koopman_ros.panel.model_card import model_card, training_ranges
-from koopman_ros.panel.requests import Action, action_text, Answer, MANUAL, Requests, SETPOINT
+from koopman_ros.panel.requests import (
+    Action,
+    Answer,
+    AuditEntry,
+    MANUAL,
+    Requests,
+    SETPOINT,
+    UNKNOWN,
+)
 from koopman_ros.panel.snapshot import (
     CONTROL,
     CONTROLLER,
@@ -161,7 +169,7 @@ class PanelNode(LoopNode):
         settings = self.settings
         server = PanelServer(
             self, settings.host, settings.port, settings.users, settings.tls_certificate,
-            settings.tls_key, [*filter(None, settings.trusted_proxy)])
+            settings.tls_key, [*filter(None, settings.trusted_proxy)], settings.command_timeout)
         server.start()
         return server
 
@@ -176,8 +184,9 @@ class PanelNode(LoopNode):
 
     @property
     def title(self) -> str:
-        """Title of all pages."""
-        return self.settings.title or self.snapshot.plant or self.settings.system
+        """Title of all pages: by default the namespace, which tells loops apart, and the plant."""
+        return self.settings.title or ' '.join(filter(None, (
+            self.get_namespace().strip('/'), self.snapshot.plant or self.settings.system)))
 
     @property
     def learning(self) -> Learning:
@@ -214,8 +223,8 @@ class PanelNode(LoopNode):
         except records.RecordError as error:
             self.get_logger().warning(str(error), throttle_duration_sec=10.0)
             return
-        self.view.take_record(record.event, record.fields, time.time())
-        self._requests.take_record(record.event, record.fields, time.monotonic())
+        who = self._requests.take_record(record.event, record.fields, time.monotonic())
+        self.view.take_record(record.event, record.fields, time.time(), who)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -284,8 +293,9 @@ class PanelNode(LoopNode):
                 reply(Answer(False, str(error) or type(error).__name__))
 
     def _reply(self, action: Action, future: Future[Answer], answer: Answer) -> None:
-        self._operator_actions.publish(String(data=action_text(
-            action, answer, time.time(), self.view.read.get(action.name, ''))))
+        entry = AuditEntry.of(action, answer, time.time(), self.view.read.get(action.name, ''))
+        self.view.take_action(entry)
+        self._operator_actions.publish(String(data=entry.text()))
         word = 'accepted' if answer.accepted else 'rejected'
         value = sanitize_text(f'{action.name} {action.value}', _LOGGED)
         self.get_logger().info(f'{action.who}: {action.what} {value}: {word}')
@@ -303,11 +313,14 @@ class PanelNode(LoopNode):
         elif action.what == 'end comparison':
             reply(self._watch.cancel())
         elif action.what == 'parameters':
+            self._requests.expect('parameters', action.who, time.monotonic())
             self._nodes[action.name].set_parameters(action.value, lambda response: reply(
                 self._unanswered(action.name) if response is None else Answer(
                     response.result.successful, response.result.reason or 'set')))
         else:
             role, service, kind = _SERVICES[action.what]
+            if event := {'automatic': 'mode', 'reload': 'model'}.get(action.what):
+                self._requests.expect(event, action.who, time.monotonic())
             request = kind.Request() if kind is Trigger else kind.Request(data=bool(action.value))
             self._nodes[role].call(service, request, lambda response: reply(
                 self._unanswered(role) if response is None else Answer(
@@ -316,8 +329,8 @@ class PanelNode(LoopNode):
     def _unanswered(self, role: str) -> Answer:
         if not self._nodes[role].running:
             return _not_running(role)
-        return Answer(False, f'the {role} did not answer within {remote_node.TIMEOUT:g} s: check '
-                             'its log; it may still carry out the request')
+        return Answer(False, f'{UNKNOWN}the {role} did not answer within {remote_node.TIMEOUT:g} '
+                             's: check its log; it may still carry out the request')
 
     def _send(self, action: Action, reply: Callable[[Answer], None]) -> None:
         """Publish a set-point or a manual command until the controller answers."""
@@ -349,7 +362,7 @@ class PanelNode(LoopNode):
         to_field, from_field = conversion(unit, place.unit), conversion(place.unit, unit)
         self._requests.add(SETPOINT if setpoint else MANUAL, name,
                            float(from_field(float(to_field(own)))), time.monotonic(), on_answer,
-                           accepted)
+                           accepted, action.who)
 
     def _rejection(self, codes: Sequence[str], name: str, value: float) -> str:
         """Write the reason of a rejected set-point; '' if only the controller knows it."""

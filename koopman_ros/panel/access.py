@@ -11,7 +11,6 @@ import argparse
 from collections.abc import Mapping, Sequence
 import contextlib
 from dataclasses import dataclass
-from enum import Enum
 import getpass
 import os
 from pathlib import Path
@@ -27,6 +26,7 @@ from argon2.exceptions import Argon2Error, InvalidHashError
 
 from koopman_ros.core.paths import write_atomically
 from koopman_ros.panel.files import read_bounded
+from koopman_ros.panel.requests import Role
 
 MAX_FILE = 256 * 1024  # bytes
 MIN_PASSWORD = 8  # characters
@@ -35,13 +35,6 @@ MAX_PASSWORD = 1024
 _NAME = re.compile(r'[\w.@-]{1,64}')
 _MAX_MEMORY = 256 * 1024  # KiB of argon2 for one log-in
 _HASHER = PasswordHasher()
-
-
-class Role(Enum):
-    """Permissions of a user; the value is the word in the file."""
-
-    VIEWER = 'viewer'  #: sees all pages
-    OPERATOR = 'operator'  #: sees all pages and operates the loop
 
 
 def hashed(password: str) -> str:
@@ -108,7 +101,7 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('file', type=Path, metavar='FILE', help='file of users; may be missing')
     parser.add_argument('name', metavar='NAME', help='letters, digits and . _ @ -')
     parser.add_argument('role', metavar='ROLE', choices=[role.value for role in Role],
-                        help='viewer or operator')
+                        help='viewer, operator or engineer')
     chosen = parser.parse_args(args)
     try:
         # before the questions
@@ -183,7 +176,7 @@ def _user(line: str) -> tuple[str, _User]:
     name = normalised(name)
     _check_name(name)
     if role not in [one.value for one in Role]:
-        raise ValueError("the role must be 'viewer' or 'operator'")
+        raise ValueError('the role must be viewer, operator or engineer')
     try:
         memory = extract_parameters(secret).memory_cost
     except InvalidHashError as error:

@@ -15,6 +15,7 @@ from koopman_ros.panel.files import sanitize_text
 
 MAX_TEXT = 500  # characters
 MAX_WHO = 64
+MAX_ALARMS = 1000  #: of these, the oldest that have returned make room for others
 _FOUND_AGAIN = 10.0  # s after a restart until the conditions are reported again
 
 
@@ -52,6 +53,11 @@ class Alarm:
     shelved_until: float | None = None  #: wall time
     acknowledged_by: str = ''
 
+    @property
+    def source(self) -> str:
+        """The node of its condition, or what is watched."""
+        return self.key.partition(':')[0].removeprefix('silence of ').partition(',')[0]
+
 
 @dataclass(frozen=True)
 class AlarmLogEntry:
@@ -81,6 +87,7 @@ class _Record:
         self.shelved_until: float | None = None
         self.acknowledged_by = ''
         self.shown = self.reported = self.nearest = 0
+        self.delay: float | None = None  # s of its own before it is raised
         self.changed = 0.0  # when the reported rank left the shown one
 
     @property
@@ -138,12 +145,14 @@ class Alarms:
         self._lock = threading.Lock()
         self.noted = 0  #: number of all entries of the journal so far
 
-    def report(self, key: str, active: bool, priority: Priority, text: str, now: float) -> None:
+    def report(self, key: str, active: bool, priority: Priority, text: str, now: float,
+               delay: float | None = None) -> None:
         """
         Report whether a condition is active, at any rate.
 
         :param key: of the condition.
         :param now: if it jumps back, delays and shelving keep their remaining time.
+        :param delay: s from the condition to its alarm instead of `delay_on`.
         """
         with self._lock:
             self._advance(now)
@@ -151,9 +160,10 @@ class Alarms:
             if record is None:
                 if not active:
                     return
+                self._make_room()
                 record = self._records[key] = _Record(key, priority)
             if active:
-                record.text = sanitize_text(text, MAX_TEXT)
+                record.text, record.delay = sanitize_text(text, MAX_TEXT), delay
             record.report(priority.value if active else 0, now)
             self._settle(record, now)
             self._tidy(record)
@@ -288,7 +298,8 @@ class Alarms:
         if not record.pending:
             return math.inf
         rises = record.reported > record.shown
-        return record.changed + (self._delay_on if rises else self._delay_off)
+        on = self._delay_on if record.delay is None else record.delay
+        return record.changed + (on if rises else self._delay_off)
 
     def _settle(self, record: _Record, now: float) -> None:
         while (due := self._due(record)) <= now:
@@ -309,6 +320,16 @@ class Alarms:
             record.state = AlarmState.NORMAL if acknowledged else AlarmState.RETURNED
             record.acknowledged_by = ''
             self._note(time, record, 'returned')
+
+    def _make_room(self) -> None:
+        """Drop the oldest alarm that has returned: texts may differ without end."""
+        if len(self._records) >= MAX_ALARMS:
+            gone = min((one for one in self._records.values()
+                        if one.state is AlarmState.RETURNED and one.shelved_until is None),
+                       key=lambda one: one.since, default=None)
+            if gone is not None:
+                self._running.discard(gone.key)
+                del self._records[gone.key]
 
     def _tidy(self, record: _Record) -> None:
         """Keep track of running delays, and delete an idle record."""

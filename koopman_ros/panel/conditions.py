@@ -7,9 +7,10 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 import re
 
-from koopman_ros.panel.alarms import Alarms, Priority
+from koopman_ros.panel.alarms import Alarm, Alarms, Priority
 from koopman_ros.panel.files import sanitize_text
 from koopman_ros.panel.snapshot import (
+    CONNECTIONS,
     CONTROL,
     CONTROLLER,
     ERROR,
@@ -17,6 +18,7 @@ from koopman_ros.panel.snapshot import (
     MEASUREMENTS,
     OK,
     PLANT,
+    RECORDING,
     REQUESTS,
     ROLES,
     SilentTopic,
@@ -27,14 +29,45 @@ from koopman_ros.panel.snapshot import (
 
 _SILENT = 3.5  # s without a status, of which there is one per second
 _START = 30.0  # s for which the nodes of a loop may start one after the other
-_GONE = 10.0  # s without a status until a simulated plant counts as gone
+_STALE = 10.0  # s without a status after which its alarms are marked as stale
+_GONE = 60.0  # s after which its node is gone for good, and its alarms return
 _ENDED = 10.0  # s for which an experiment or training that failed is an active alarm
 _PERIODS = 5.0  # usual times between two measurements without one
 _MAX_TASKS = 64  # statuses of the loop that are kept, and of other nodes
 _MAX_NAME = 200  # characters
 # errors within seconds that are an alarm, however short each of them is
 _REPEATED, _WITHIN = 5, 60.0
+#: of tasks, where it does not follow from the level: that of the loss of the command, and that of
+#: what disturbs no control
+_PRIORITIES = {CONNECTIONS: Priority.HIGH, EXPERIMENT: Priority.LOW, TRAINING: Priority.LOW,
+               RECORDING: Priority.MEDIUM}
+#: tasks and silences from causes to consequences
+_CAUSES = ('silence of plant', 'silence of controller', f'{PLANT}: ', MEASUREMENTS, CONTROL,
+           f'{CONTROLLER}: ', 'process: ', f'{TRAINER}: ')
+_SPREADS = 30.0  # s within which the consequences of a cause are raised
 _NUMBER = re.compile(r'(?<![\w.])[-+]?\d+(\.\d+)?(e[-+]\d+)?')
+
+
+def grouped(alarms: Sequence[Alarm]) -> list[tuple[Alarm, Sequence[Alarm]]]:
+    """
+    Return alarms with their consequences, in the order of the causes.
+
+    The cause is the alarm that stands nearest to the plant in the loop, of those that were raised
+    within half a minute.
+    """
+    def depth(alarm: Alarm) -> int:
+        return next((at for at, prefix in enumerate(_CAUSES) if alarm.key.startswith(prefix)), -1)
+
+    causes: dict[str, list[Alarm]] = {}
+    # the first alarm of a depth may be the cause of all that are deeper
+    heads: list[Alarm] = []
+    for alarm in sorted(alarms, key=lambda one: (depth(one), one.since)):
+        head = next((one for one in heads if 0 <= depth(one) < depth(alarm)
+                     and abs(alarm.since - one.since) <= _SPREADS), None)
+        if head is None:
+            heads.append(alarm)
+        causes.setdefault((head or alarm).key, []).extend([alarm] if head else [])
+    return [(alarm, causes[alarm.key]) for alarm in alarms if alarm in heads]
 
 
 class Conditions:
@@ -53,8 +86,8 @@ class Conditions:
         # wall time and message of the last changes to ERROR, by task
         self._errors: dict[str, deque[tuple[float, str]]] = {}
         self._keys: dict[str, tuple[str, ...]] = {}  # of the alarms of each task
+        self._heard: dict[str, float] = {}  # wall time of the last status, by task
         self._since: dict[str, float] = {}  # wall time of the present message, by task
-        self._simulated = now  # wall time of the last status of a simulated plant
         self._begun: dict[str, float] = {}  # wall time of the first message, by role
         self._last: dict[str, float] = {}  # wall time of the last message, by role
         self._period = 0.0  # of the measurements
@@ -101,8 +134,6 @@ class Conditions:
                 self._watched.append(role)
         if role in (PLANT, CONTROLLER):
             self.plant = plant or self.plant
-        if role == PLANT:
-            self._simulated = now
         before = self.statuses.get(name)
         status = self.statuses[name] = TaskStatus(
             name, level, message or ('' if level == OK else 'no reason was given'), dict(values))
@@ -110,17 +141,21 @@ class Conditions:
             self._since[name] = now
         if level >= ERROR and (before is None or before.level < ERROR):
             self._errors.setdefault(name, deque(maxlen=_REPEATED)).append((now, status.message))
-        priority = Priority.HIGH if level >= ERROR else (
-            Priority.MEDIUM if role == CONTROLLER else Priority.LOW)
-        active, texts = level > OK and self._is_alarm(status, now), {name: status.message}
+        self._heard[name] = now
+        priority = _PRIORITIES.get(name, Priority.HIGH if level >= ERROR else (
+            Priority.MEDIUM if role == CONTROLLER else Priority.LOW))
+        active = level > OK and self._is_alarm(status, now)
+        # one alarm a condition, which is its sentence without the numbers
         warnings = [text for key, text in values.items() if key.startswith('warning ')]
-        if warnings := warnings or [status.message] * (name == CONTROL):
-            # a condition is its sentence without the numbers
-            texts = {sanitize_text(f'{name}: {_NUMBER.sub("#", text)}', _MAX_NAME): text
-                     for text in warnings}
+        texts = {sanitize_text(f'{name}: {_NUMBER.sub("#", text)}', _MAX_NAME): text
+                 for text in warnings or [status.message]}
+        # of texts that alternate, each would end before the delay
+        replaced = before is not None and before.level > OK and not (
+            set(texts) & set(self._keys[name]))
         for key in {*self._keys.get(name, ()), *texts}:
             self.alarms.report(key, active and key in texts, priority,
-                               f'{name}: {texts.get(key, "")}', now)
+                               f'{name}: {texts.get(key, "")}', now,
+                               0.0 if replaced else None)
         self._keys[name] = tuple(texts)
 
     def _forget_one(self, tasks: Sequence[str], now: float) -> bool:
@@ -135,7 +170,7 @@ class Conditions:
     def _forget(self, name: str, now: float) -> None:
         """Forget a task, whose alarms return."""
         status = self.statuses.pop(name)
-        del self._since[name]
+        del self._since[name], self._heard[name]
         for key in self._keys.pop(name):
             self.alarms.report(key, False, Priority.LOW, status.message, now)
 
@@ -172,10 +207,10 @@ class Conditions:
     def advance(self, now: float) -> None:
         """Raise the alarms of silence and of repeated errors, and let delays run out."""
         self._follow_clock(now)
-        if now - self._simulated > _GONE:
-            # perhaps a driver without statuses has replaced it
-            for name in [task for task in self.statuses if task.startswith(f'{PLANT}: ')]:
-                self._forget(name, now)
+        for name in [task for task, heard in self._heard.items() if now - heard > (
+                # perhaps a driver without statuses has replaced a simulated plant
+                _STALE if task.startswith(f'{PLANT}: ') else _GONE)]:
+            self._forget(name, now)
         for name, errors in self._errors.items():
             often = len(errors) == _REPEATED and now - errors[0][0] <= _WITHIN
             self.alarms.report(
@@ -198,12 +233,16 @@ class Conditions:
         self._now = now
         if back:
             self._start -= back
-            self._simulated -= back
-            for times in (self._since, self._begun, self._last):
+            for times in (self._since, self._heard, self._begun, self._last):
                 times.update({key: time - back for key, time in times.items()})
             for name, errors in self._errors.items():
                 self._errors[name] = deque(
                     [(time - back, text) for time, text in errors], _REPEATED)
+
+    def stale(self, now: float) -> frozenset[str]:
+        """Return the keys of alarms whose nodes no longer report them."""
+        return frozenset(key for name, heard in self._heard.items() if now - heard > _STALE
+                         for key in self._keys.get(name, ()))
 
     def silences(self, now: float) -> tuple[SilentTopic, ...]:
         """Return the silent nodes."""

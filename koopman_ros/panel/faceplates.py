@@ -5,14 +5,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 import math
 
 from koopman_ros.core.units import conversion, printed
 
 Range = tuple[float, float]
+PLANT, CONTROLLER, TRAINER = 'plant', 'controller', 'trainer'  #: roles of nodes
 _LARGEST = 1e300  # on a bar: a broken sensor may send the largest number that there is
+_FAR = 0.1  # of the range of an input; an applied input that differs by more is abnormal
+_HELD = {'hold': 'held: the last command', 'safe': 'the safe input is commanded'}  # by level
+#: kinds of values by the node without which they are old
+_SENT_BY = {PLANT: ('measured', 'applied', 'predicted', 'setpoint'),
+            CONTROLLER: ('command', 'predicted', 'setpoint')}
 _EXACT = 1e15  # from here on not all digits of a number are known
 
 
@@ -26,6 +32,14 @@ def number(value: float, decimals: int) -> str:
     if not math.isfinite(value):
         return '–'
     return f'{value:z.{decimals}f}' if abs(value) < _EXACT else f'{value:.6g}'
+
+
+def exact(value: float, decimals: int) -> str:
+    """Write a value that was asked for, with all digits that were written, of at most eight."""
+    more = next((more for more in range(decimals, 9)
+                 if math.isclose(round(value, more), value, rel_tol=1e-9, abs_tol=1e-12)),
+                decimals)
+    return number(value, more)
 
 
 def span_text(bounds: Range, decimals: int) -> str:
@@ -58,6 +72,7 @@ class Faceplate:
     limits: Range | None  #: of the command, or of a state in the MPC
     active: str  #: active limits of the plan in words, or empty
     plan: Sequence[tuple[float, float]]  #: times and values ahead; empty without a plan
+    old: frozenset[str]  #: kinds of its values that come from a node that is silent
 
     @property
     def label(self) -> str:
@@ -67,6 +82,10 @@ class Faceplate:
     def text(self, value: float) -> str:
         """Write a value without the unit."""
         return number(value, self.decimals)
+
+    def exact(self, value: float) -> str:
+        """Write a value that was asked for, without the unit."""
+        return exact(value, self.decimals)
 
     def span_text(self, bounds: Range) -> str:
         """Write a range without the unit."""
@@ -121,38 +140,58 @@ class SignalValues:
         """Return the last value of a kind."""
         return self.values.get(kind, default)
 
-    def state(self, controlled: bool, limits: Range | None, sensor: Range | None, silent: bool,
-              disturbance: bool = False) -> StateFaceplate:
-        """Return the faceplate of a state, or disturbance, with limits and range of the sensor."""
+    def state(self, controlled: bool, limits: Range | None, sensor: Range | None,
+              silent: Container[str], quality: str, disturbance: bool = False) -> StateFaceplate:
+        """
+        Return the faceplate of a state, or disturbance, with limits and range of the sensor.
+
+        :param silent: roles of nodes.
+        :param quality: of the measurement as the controller has it, in words; empty for good.
+        """
         measured, setpoint = self.get('measured'), self.get('active_setpoints')
         span = _span([self.training, sensor], [measured, setpoint, *(limits or ())])
         abnormal = ''
-        if silent or math.isnan(measured):
+        if PLANT in silent or math.isnan(measured):
             abnormal = 'no measurement'
+        elif quality:
+            abnormal = f'measurement {quality}'
         elif self.training and not self.training[0] <= measured <= self.training[1]:
             side = 'above' if measured > self.training[1] else 'below'
             abnormal = f'{side} the trained range'
         return StateFaceplate(
             self.name, printed(self.read), span, _decimals(span), self.training, abnormal, limits,
-            self.active, self.plan, controlled, measured, setpoint, self.get('target', setpoint),
-            self.get('predicted'), disturbance)
+            self.active, self.plan, _old(silent), controlled, measured, setpoint,
+            self.get('target', setpoint), self.get('predicted'), disturbance)
 
-    def input(self, limits: Range | None, silent: bool) -> InputFaceplate:
-        """Return the faceplate of an input with its limits."""
+    def input(self, limits: Range | None, silent: Container[str], level: str) -> InputFaceplate:
+        """
+        Return the faceplate of an input with its limits.
+
+        :param silent: roles of nodes.
+        :param level: name of the control level.
+        """
         command, applied = self.get('commands'), self.get('applied')
         span = _span([limits, self.training], [command, applied])
         slack = 1e-6 * (span[1] - span[0])
         abnormal = ''
-        if silent and math.isfinite(command):
+        if CONTROLLER in silent and math.isfinite(command):
             abnormal = 'last command, the controller is silent'
+        elif PLANT not in silent and abs(applied - command) > _FAR * (span[1] - span[0]):
+            abnormal = 'applied differs from the command'
+        elif level in _HELD:
+            abnormal = _HELD[level]
         elif limits and command >= limits[1] - slack:
             abnormal = 'at its upper limit'
         elif limits and command <= limits[0] + slack:
             abnormal = 'at its lower limit'
         return InputFaceplate(
             self.name, printed(self.read), span, _decimals(span), self.training, abnormal, limits,
-            self.active, self.plan, command, applied, self.get('manual', command),
+            self.active, self.plan, _old(silent), command, applied, self.get('manual', command),
             self.get('disturbance'), self.unit)
+
+
+def _old(silent: Container[str]) -> frozenset[str]:
+    return frozenset(kind for role, kinds in _SENT_BY.items() if role in silent for kind in kinds)
 
 
 def _span(ranges: Sequence[Range | None], values: Sequence[float]) -> Range:

@@ -17,8 +17,8 @@ from typing import Any, Protocol, Self, TypeVar
 from nicegui import ui
 from nicegui.element import Element
 
-from koopman_ros.panel.alarms import AlarmState
-from koopman_ros.panel.requests import Action, Answer
+from koopman_ros.panel.alarms import Alarm, AlarmState, Priority
+from koopman_ros.panel.requests import Action, Answer, required_role, Role, UNKNOWN
 from koopman_ros.panel.snapshot import Snapshot
 from koopman_ros.panel.training_report import Learning
 from koopman_ros.panel.view_model import LoopViewModel
@@ -26,13 +26,19 @@ from koopman_ros.panel.view_model import LoopViewModel
 PERIOD = 0.25  # s between two updates of a page
 _TIMEOUT = 40.0  # s for an answer
 TABS = {'/': 'Overview', '/trends': 'Trends', '/alarms': 'Alarms', '/model': 'Model',
-         '/tuning': 'Tuning'}
+        '/tuning': 'Tuning', '/audit': 'Audit'}
 _CSS, _WATCH = ((files(__package__) / name).read_text() for name in ('style.css', 'watch.js'))
-_TEXTS = ('alt', 'aria-label', 'data-beat', 'data-parameter', 'data-signal')
+_TEXTS = ('alt', 'aria-label', 'data-beat', 'data-parameter', 'data-present', 'data-signal',
+          'data-sound', 'data-title')
+_SETTLED = 2.0  # s after which an answer no longer holds if the loop changes
+#: frequency of the sound in Hz, and symbol, of each priority
+SOUNDS = {Priority.HIGH: '880', Priority.MEDIUM: '660', Priority.LOW: '440'}
+SYMBOLS = {Priority.HIGH: '■', Priority.MEDIUM: '▲', Priority.LOW: '●'}
 _ADDRESSES = ('href', 'src')
 _DEGREES = re.compile(r'\bdeg(?=[CF]\b)')
 _Kind = TypeVar('_Kind', bound=Element)
-NOT_ALLOWED = Answer(False, 'view only: log in as operator to make changes')
+NOT_ALLOWED = {role: Answer(False, f'for {role.value}s only: log in as {role.value}')
+               for role in Role}
 
 
 class Source(Protocol):
@@ -58,9 +64,13 @@ class Visitor:
     """User of a page."""
 
     name: str
-    may_act: Callable[[], bool]  #: whether it is an operator; called before each action
+    role: Callable[[], Role]  #: its permissions; called before each action
     may_look: Callable[[], bool] = lambda: True  #: whether it is still logged in
     named: bool = False  #: whether it can log out
+
+    def may(self, role: Role) -> bool:
+        """Return whether the user has the permissions of a role."""
+        return self.role().includes(role)
 
 
 def clock(seconds: float) -> str:
@@ -77,7 +87,8 @@ class PageLayout:
 
     def __init__(self, source: Source, visitor: Visitor, path: str) -> None:
         self.source, self.visitor, self._path = source, visitor, path
-        self.enabled = visitor.may_act()  #: whether the controls can be used
+        # without a look at the session, which would be a use of it
+        self._role = visitor.role()
         self._shown: Snapshot | None = None
         self._updates: list[Callable[[Snapshot], None]] = []
         self._beat_at = 0.0
@@ -86,16 +97,19 @@ class PageLayout:
         ui.page_title(f'{TABS[path]} – {source.title}')
         ui.colors(primary='#4a4a47', secondary='#6b6b67', accent='#4a4a47', positive='#4a4a47')
         self._head(path)
-        self.body = box('page')
+        self.body = box('page', tag='main')
 
     def _head(self, path: str) -> None:
-        with box('head', tag='header'):
+        with box('head', tag='header') as head:
             title = label('h1', self.source.title)
             mode, level = label('div', ''), label('div', '', 'quiet')
+            experiment = label('div', '', 'abnormal hidden')
             beat = label('div', '', 'right quiet').props('id=beat')
-            label('div', self.visitor.name + ('' if self.enabled else ' (viewer)'), 'quiet')
+            label('div', f'{self.visitor.name} ({self._role.value})' if self.visitor.named else (
+                self.visitor.name), 'quiet')
             if self.visitor.named:
                 link('Log out', '/logout')
+        self.strip = box('row1 strip-head')  #: place of the most urgent alarm
         with box('tabs', tag='nav').props('aria-label=Pages'):
             tabs = {target: link(name, target) for target, name in TABS.items()}
         tabs[path].classes('here').props('aria-current=page')
@@ -105,15 +119,20 @@ class PageLayout:
             title.set_text(self.source.title)
             mode.set_text(now.mode.upper() or 'MODE NOT KNOWN')
             level.set_text(now.level if now.level != now.mode else '')
-            unacknowledged = sum(alarm.state is not AlarmState.ACKNOWLEDGED
-                                 for alarm in now.standing)
-            tabs['/alarms'].set_text(
-                f'Alarms ({unacknowledged})' if unacknowledged else 'Alarms')
-            # also where the clock was set back
-            if abs(now.wall - self._beat_at) >= 1.0:
-                self._beat_at = now.wall
+            experiment.set_text(f'EXPERIMENT, {now.experiment} s left')
+            show_if(experiment, bool(now.experiment))
+            waiting = unacknowledged(now.standing)
+            worst = waiting[0].priority if waiting else None
+            tabs['/alarms'].set_text(f'Alarms ({len(waiting)})' if waiting else 'Alarms')
+            found = f'{TABS[path]} – {self.source.title}'
+            attribute(head, 'data-title', f'{SYMBOLS[worst]} {worst.word.upper()} '
+                      f'({len(waiting)}) {found}' if worst else found)
+            attribute(head, 'data-sound', SOUNDS[worst] if worst else '')
+            # the panel's clock that a page has seen last tells the age of what is pressed there
+            if (beat_at := time.monotonic()) - self._beat_at >= 1.0:
+                self._beat_at = beat_at
                 beat.set_text(f'wall time {clock(now.wall)}')
-                attribute(beat, 'data-beat', f'{now.wall:.1f}')
+                attribute(beat, 'data-beat', f'{beat_at:.1f}')
             silent = [f'no message from the {one.role} since {clock(one.since)}' + (
                 '' if one.seen else ', the start of the panel') for one in now.silences]
             known = any(one.seen for one in now.silences)
@@ -162,14 +181,14 @@ class PageLayout:
     # Actions.
 
     async def act(self, what: str, name: str = '', value: Any = None, old: Any = None) -> Answer:
-        """Carry out an action of the visitor if it is an operator; return the answer."""
-        if not self.visitor.may_act():
-            return NOT_ALLOWED
+        """Carry out an action of the visitor if it has the role; return the answer."""
+        if not self.visitor.may(role := required_role(what)):
+            return NOT_ALLOWED[role]
         future = self.source.request(Action(self.visitor.name, what, name, value, old))
         try:
             answer: Answer = await asyncio.wait_for(asyncio.wrap_future(future), _TIMEOUT)
         except TimeoutError:
-            answer = Answer(False, f'no answer within {_TIMEOUT:g} s')
+            answer = Answer(False, f'{UNKNOWN}no answer within {_TIMEOUT:g} s')
         self._end_if_closed()
         return answer
 
@@ -178,22 +197,23 @@ class PageLayout:
         if self.body.is_deleted:
             raise asyncio.CancelledError
 
-    def control(self, element: Any) -> Any:
-        """Return a control, disabled for a viewer."""
-        if not self.enabled:
-            element.props['title'] = NOT_ALLOWED.text
+    def control(self, element: Any, what: str = '') -> Any:
+        """Return a control, disabled for a user without the role of its action."""
+        if not self._role.includes(role := required_role(what)):
+            element.props['title'] = NOT_ALLOWED[role].text
             element.disable()
         return element
 
-    def button(self, text: str, act: Callable[[], Any]) -> ui.button:
-        """Return a button for operators."""
-        found: ui.button = self.control(ui.button(text, on_click=act).props('outline'))
+    def button(self, text: str, act: Callable[[], Any], what: str = '') -> ui.button:
+        """Return a button of an action."""
+        found: ui.button = self.control(ui.button(text, on_click=act).props('outline'), what)
         return found
 
-    def allow(self, control: Any, possible: bool, obstacle: str) -> None:
-        """Enable a control for operators while it can act; otherwise it shows the obstacle."""
+    def allow(self, control: Any, possible: bool, obstacle: str, what: str = '') -> None:
+        """Enable a control while it can act; otherwise it shows the obstacle."""
         title = '' if possible else obstacle
-        if self.enabled and (control.enabled, control.props.get('title', '')) != (possible, title):
+        if self._role.includes(required_role(what)) and (
+                control.enabled, control.props.get('title', '')) != (possible, title):
             control.props['title'] = title
             control.set_enabled(possible)
             control.update()
@@ -223,21 +243,44 @@ class PageLayout:
 
 
 class AnswerLine:
-    """Line with the answer to an action, next to its control."""
+    """
+    Line with the answer to an action, next to its control, as long as the answer holds.
 
-    def __init__(self) -> None:
+    :param basis: what the answer is about; it no longer holds when that changes afterwards.
+    """
+
+    def __init__(self, page: PageLayout,
+                 basis: Callable[[Snapshot], object] = lambda now: (now.mode, now.silences)
+                 ) -> None:
         self._label = label('div', '', 'answer').props('role=status aria-live=polite')
+        self._basis, self._held, self._since = basis, object(), 0.0
+        page.follow(self._expire)
 
     def set_text(self, text: str) -> None:
         """Show a text other than a rejection."""
         self._label.set_text(text)
         self._label.classes(remove='rejected')
+        self._since = time.monotonic()
 
     def show(self, answer: Answer) -> None:
         """Show an answer."""
         self.set_text(str(answer) if answer.accepted else f'✖ {answer}')
         if not answer.accepted:
             self._label.classes('rejected')
+
+    def _expire(self, now: Snapshot) -> None:
+        if not self._label.text:
+            return
+        # what was asked for takes effect at first
+        if time.monotonic() - self._since < _SETTLED:
+            self._held = self._basis(now)
+        elif self._basis(now) != self._held:
+            self.set_text('')
+
+
+def unacknowledged(alarms: Sequence[Alarm]) -> list[Alarm]:
+    """Return the alarms that wait for an acknowledgement, in their order."""
+    return [alarm for alarm in alarms if alarm.state is not AlarmState.ACKNOWLEDGED]
 
 
 def show_if(element: Element, shown: bool) -> None:
@@ -263,6 +306,8 @@ def attribute(element: _Kind, name: str, text: str) -> _Kind:
     :raises ValueError: for any other attribute, or another address.
     """
     own = name in _ADDRESSES and text.startswith('/') and not text.startswith('//')
+    if element.props.get(name) == text:
+        return element
     if name not in _TEXTS and not own:
         raise ValueError(f'{name} = {text!r} cannot be set: give a text to one of '
                          f'{", ".join(_TEXTS)}, or a path to one of {", ".join(_ADDRESSES)}')

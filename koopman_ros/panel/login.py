@@ -17,8 +17,9 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
-from koopman_ros.panel.access import Role, Users
+from koopman_ros.panel.access import Users
 from koopman_ros.panel.layout import Source, TABS, Visitor
+from koopman_ros.panel.requests import Role
 from koopman_ros.panel.sessions import Session, Sessions, Throttle
 
 _LONGEST_FORM = 8192  # bytes
@@ -46,18 +47,18 @@ class AccessControl:
     def session(self, scope: Mapping[str, Any], *, use: bool = True) -> Session | None:
         """Return the session of a request, None if no user is logged in."""
         if self.users is None:
-            return Session('operator', Role.OPERATOR)
+            return Session('operator', Role.ENGINEER)
         return self.sessions.find(self.session_id(scope), use=use)
 
     def visitor(self, scope: Mapping[str, Any]) -> Visitor:
         """Return the visitor of a page."""
         session = self.session(scope)
 
-        def may_act() -> bool:
+        def role() -> Role:
             found = self.session(scope)
-            return found is not None and found.role is Role.OPERATOR
+            return found.role if found else Role.VIEWER
 
-        return Visitor(session.name if session else 'nobody', may_act,
+        return Visitor(session.name if session else 'nobody', role,
                        lambda: self.session(scope, use=False) is not None, self.users is not None)
 
 

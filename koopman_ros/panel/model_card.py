@@ -9,13 +9,13 @@ from datetime import datetime
 
 from koopman_ros.model import LiftedModel
 from koopman_ros.panel.faceplates import Range, readable
-from koopman_ros.panel.snapshot import Snapshot
+from koopman_ros.panel.snapshot import CONTROL, Snapshot, TRAINER, TRAINING
 
 _STATUS = {'model file time': 'File written', 'model training data': 'Training data (digest)',
            'model reloads': 'Reloads', 'model rejected': 'Last file rejected',
            'model check': 'Check on recent data', 'law': 'Control law',
            'gain norm': 'Norm of the feedback gain',
-           'predicted growth per sample': 'Predicted growth per sample'}
+           'predicted growth per sample': 'Decay of errors per sample (1: none)'}
 #: figures of a training, by their key without the signal
 _TRAINING = {'step': 'Step', 'model_class': 'Model class',
              'measurements_used': 'Measurements used',
@@ -49,23 +49,48 @@ def model_card(model: LiftedModel) -> dict[str, str]:
     return found | {title: f'{figure:.4g}' for title, figure in model.figures.items()}
 
 
-def model_changes(now: Snapshot, new: LiftedModel, trained: Mapping[str, Range]
+def model_changes(now: Snapshot, name: str, new: LiftedModel, trained: Mapping[str, Range]
                   ) -> list[Sequence[str]]:
     """
     Return the changes by a new model: a title, and the value of the active and the new model.
 
+    Errors are those of both models on the same data: the last training has them if it compared
+    these two. Figures in the files are of the data of each.
+
+    :param name: file of the new model.
     :param trained: training ranges of the new model, in the units in which people read them.
     """
     rows: list[Sequence[str]] = []
     for face in (*now.states, *now.inputs):
-        active, other = (face.span_text(bounds) if bounds else '–'
-                         for bounds in (face.training, trained.get(face.name)))
-        rows.append((f'Training range, {face.label} [{face.unit}]', active, other))
+        other = trained.get(face.name)
+        active, wanted = (face.span_text(bounds) if bounds else '–'
+                          for bounds in (face.training, other))
+        rows.append((f'Training range, {face.label} [{face.unit}]', active, wanted))
+        if face.training and other:
+            rows += [(f'  {word} by the new model', '', '; '.join(
+                face.span_text(part) for part in parts))
+                for word, parts in (('gained', _beyond(other, face.training)),
+                                    ('lost', _beyond(face.training, other))) if parts]
     card = model_card(new)
     # the reasons of a verdict fill no column
-    return rows + [(title, *(one.get(title, '–').partition(' (')[0] for one in (now.model, card)))
-                   for title in dict.fromkeys((*now.model, *card))
-                   if title in _COMPARED or title.startswith('Held-out')]
+    rows += [(title, *(one.get(title, '–').partition(' (')[0] for one in (now.model, card)))
+             for title in _COMPARED]
+    training, active = now.status(TRAINING).values, now.status(CONTROL).values.get('model', '')
+    signals = [key.partition(': ')[2] for key in training if key.startswith('heldout_error: ')]
+    # the trainer compares with the model of its parameter
+    same = training.get('model_file') == name and active == now.parameter(TRAINER, 'model')
+    rows += [(f'Error on the new record, {readable(signal)} [{training.get(f"units: {signal}")}]',
+              training.get(f'heldout_error_of_current_model: {signal}', '–'),
+              training[f'heldout_error: {signal}']) for signal in signals if same]
+    if not (same and signals):
+        rows.append(('Error on the same data', 'not known', 'compare on the last hour first'))
+    return rows
+
+
+def _beyond(one: Range, other: Range) -> list[Range]:
+    """Return the parts of a range outside another."""
+    parts = (one[0], min(one[1], other[0])), (max(one[0], other[1]), one[1])
+    return [part for part in parts if part[0] < part[1]]
 
 
 def training_card(values: Mapping[str, str]) -> dict[str, str]:

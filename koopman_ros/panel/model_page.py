@@ -19,7 +19,7 @@ from koopman_ros.panel.faceplates import readable
 from koopman_ros.panel.layout import AnswerLine, box, label, PageLayout, show_if
 from koopman_ros.panel.model_card import model_changes, status_card, training_card, training_ranges
 from koopman_ros.panel.report_cards import comparison_card, report_card
-from koopman_ros.panel.requests import Action, Answer
+from koopman_ros.panel.requests import Action, Answer, Role
 from koopman_ros.panel.snapshot import (
     CONTROL,
     CONTROLLER,
@@ -32,7 +32,6 @@ from koopman_ros.panel.snapshot import (
     TRAINING,
     WARN,
 )
-from koopman_ros.parameters.description import ParameterDescription
 
 _DONE = 'done [%]'
 _FORCE = 'load_rejected_model'
@@ -121,7 +120,7 @@ def _model(page: PageLayout) -> None:
                 rejected = new.provenance.accepted is False
                 reasons = '; '.join(new.provenance.reasons)
                 changes = [('', 'current model', 'new model'), *model_changes(
-                    now, new, view.shown_ranges(training_ranges(new)))]
+                    now, name, new, view.shown_ranges(training_ranges(new)))]
             if rejected:
                 details.append(f'✖ Training rejected this model: {reasons}.')
             if not await page.confirm('Activate this model?', 'Activate by force' if rejected
@@ -131,7 +130,7 @@ def _model(page: PageLayout) -> None:
             wanted = {'model': name, **({_FORCE: True} if rejected else {})}
             old = {key: now.parameter(CONTROLLER, key) for key in wanted}
             answer.set_text('sent …')
-            forced = old.get(_FORCE) is False and page.visitor.may_act()
+            forced = old.get(_FORCE) is False and page.visitor.may(Role.ENGINEER)
             try:
                 answer.show(await page.act('parameters', CONTROLLER, wanted, old))
             finally:
@@ -147,10 +146,11 @@ def _model(page: PageLayout) -> None:
                 page.source.learning.new_model(status.values))
 
         with box('row1'):
-            new = page.button('', lambda: activate(*trained()))
-            back = page.button('', lambda: activate(page.source.snapshot.previous_model))
-            page.button('Reload model file', reload)
-        answer = AnswerLine()
+            new = page.button('', lambda: activate(*trained()), 'parameters')
+            back = page.button('', lambda: activate(page.source.snapshot.previous_model),
+                               'parameters')
+            page.button('Reload model file', reload, 'reload')
+        answer = AnswerLine(page)
 
     def show(now: Snapshot) -> None:
         control = now.status(CONTROL)
@@ -178,7 +178,7 @@ def _buttons(page: PageLayout, actions: Mapping[str, Callable[[], Awaitable[Answ
 
     with box('row1'):
         buttons = [page.button(text, partial(press, act)) for text, act in actions.items()]
-    answer = AnswerLine()
+    answer = AnswerLine(page)
     return buttons
 
 
@@ -204,7 +204,7 @@ def _experiment(page: PageLayout) -> None:
         limits, obstacle = label('div', '', 'lines quiet'), label('div', '', 'hidden')
 
         async def start() -> Answer | None:
-            lines = experiment_limits(page.source.snapshot.parameters.get(TRAINER, {}))
+            lines = experiment_limits(page.source.snapshot)
             return await page.act('experiment', TRAINER, True) if await page.confirm(
                 'Start the experiment?', 'Start the experiment',
                 ['The experiment applies random steps within these limits:', *lines]) else None
@@ -218,23 +218,18 @@ def _experiment(page: PageLayout) -> None:
         obstacle.set_text(f'Start is not possible: {reason}')
         show_if(obstacle, bool(reason))
         page.allow(begin, not reason, reason)
-        page.allow(end, experiment_running(now), 'no experiment is running')
+        page.allow(end, bool(now.experiment), 'no experiment is running')
         task.show(found, {'time left [s]' if key == 'left [s]' else key: value
                           for key, value in found.values.items()})
-        limits.set_text('\n'.join(experiment_limits(now.parameters.get(TRAINER, {}))))
+        limits.set_text('\n'.join(experiment_limits(now)))
 
     page.follow(show)
-
-
-def experiment_running(now: Snapshot) -> bool:
-    """Return whether an experiment can be ended."""
-    return now.status(EXPERIMENT).values.get('left [s]', '0') != '0'
 
 
 def experiment_obstacle(now: Snapshot) -> str:
     """Return why no experiment can start, and what to do, or nothing."""
     signal = now.parameter(TRAINER, 'experiment_signal')
-    if experiment_running(now):
+    if now.experiment:
         return 'an experiment is running'
     if signal == 'command' and now.mode:
         return ('the controller commands the inputs; stop it, or set experiment_signal to '
@@ -244,8 +239,10 @@ def experiment_obstacle(now: Snapshot) -> str:
         f'with experiment_signal = {signal}, the controller must be in {wanted} mode')
 
 
-def experiment_limits(parameters: Mapping[str, ParameterDescription]) -> list[str]:
-    """Return the steps and limits of an experiment, in lines."""
+def experiment_limits(now: Snapshot) -> list[str]:
+    """Return the steps and limits that hold in the mode of an experiment, in lines."""
+    parameters = now.parameters.get(TRAINER, {})
+    inputs = {face.name: face for face in now.inputs}
     if 'experiment_signal' not in parameters:
         return ['Trainer not running: no limits available']
 
@@ -260,12 +257,19 @@ def experiment_limits(parameters: Mapping[str, ParameterDescription]) -> list[st
         signal, _, last = name.rpartition('.')
         if last != 'experiment_min':
             continue
+        is_input = f'{signal}.safe_value' in parameters
         if on == 'setpoint' and f'{signal}.setpoint_min' in parameters:
             lines.append(f'{readable(signal)}: set-points {text(f"{signal}.setpoint_min")} to '
                          f'{text(f"{signal}.setpoint_max")}')
-        what = 'steps within' if f'{signal}.safe_value' in parameters else 'aborts outside'
-        lines.append(f'{readable(signal)}: {what} {text(name)} to '
-                     f'{text(f"{signal}.experiment_max")}')
+        if is_input and on == 'setpoint':
+            # the steps are of set-points; the controller moves the inputs
+            face = inputs.get(signal)
+            lines.append(f'{readable(signal)}: moved by the controller within its limits' + (
+                f', {face.span_text(face.limits)} {face.unit}' if face and face.limits else ''))
+        else:
+            what = 'steps within' if is_input else 'aborts outside'
+            lines.append(f'{readable(signal)}: {what} {text(name)} to '
+                         f'{text(f"{signal}.experiment_max")}')
     return lines
 
 

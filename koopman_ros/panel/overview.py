@@ -12,21 +12,18 @@ from typing import Any
 from nicegui import ui
 from nicegui.element import Element
 
-from koopman_ros.panel.alarm_page import alarm_rows
-from koopman_ros.panel.faceplates import Faceplate, InputFaceplate, number, Range, StateFaceplate
+from koopman_ros.panel.faceplates import Faceplate, InputFaceplate, number, StateFaceplate
 from koopman_ros.panel.layout import AnswerLine, attribute, box, label, PageLayout, place, show_if
 from koopman_ros.panel.requests import Answer
-from koopman_ros.panel.snapshot import CONTROL, CONTROLLER, PLANT, Snapshot
+from koopman_ros.panel.snapshot import CONTROL, CONTROLLER, PLANT, Snapshot, TRAINER
 from koopman_ros.panel.trend_chart import TrendChart
-
-_STRIP = 3  # alarms that are shown here
+from koopman_ros.parameters.description import parsed_number
 
 
 def overview(page: PageLayout) -> None:
     """Build the page."""
     now = page.source.snapshot
     with page.body:
-        _alarm_strip(page)
         with box('cards'):
             for at, state in enumerate(now.states):
                 _state_card(page, at, state)
@@ -36,18 +33,6 @@ def overview(page: PageLayout) -> None:
         _simulation(page)
         chart = TrendChart(page, 220, zoom=False)
         page.follow(lambda _: chart.update())
-
-
-def _alarm_strip(page: PageLayout) -> None:
-    rows = alarm_rows(page, 'Alarms', none='No alarms')
-    others = label('div', '', 'quiet hidden')
-
-    def show(now: Snapshot) -> None:
-        rows.show(now.standing[:_STRIP])
-        others.set_text(f'and {len(now.standing) - _STRIP} more')
-        show_if(others, len(now.standing) > _STRIP)
-
-    page.follow(show)
 
 
 class _Bar:
@@ -91,69 +76,119 @@ class _Faceplate:
         self._bar = _Bar()
         self._active = label('div', '', 'quiet')
 
-    def show(self, face: Faceplate, value: float, mark: float) -> None:
+    def show(self, face: Faceplate, value: float, mark: float, old: bool) -> None:
         self._abnormal.set_text(f'▲ {face.abnormal}')
         show_if(self._abnormal, bool(face.abnormal))
-        self._number.set_text(face.text(value))
+        _show_value(self._number, face.text(value), old)
         self._bar.show(face, value, mark)
         self._active.set_text(f'planned: {face.active}' if face.active else '')
 
 
 class _Entry:
-    """Entry of a number: typed, stepped by the arrow keys, or by a slider."""
+    """
+    Entry of a number: typed, stepped by the arrow keys, or by a slider.
 
-    def __init__(self, page: PageLayout, title: str, send: Callable[[float], Any]) -> None:
-        self._send = send
-        self._shown: float | None = None  # present value in the field until a user types
-        self._ends: Range = (0.0, 1.0)
-        with box('ask'):
-            self._field = page.control(ui.number(title, on_change=self._typed).props(
-                'outlined dense'))
-            page.control(ui.button('Set', on_click=self._submit).props('unelevated'))
+    :param present: the value that is asked for at present.
+    """
+
+    def __init__(self, page: PageLayout, title: str, send: Callable[[float], Any],
+                 present: Callable[[Snapshot], float]) -> None:
+        self._page, self._send, self._step = page, send, 1.0
+        self._shown = ''  # present value in the field until a user types
+        self._decimals = 0
+        with box('ask') as self._box:
+            self._field = page.control(ui.input(title, on_change=self._typed).props(
+                'outlined dense inputmode=decimal autocomplete=off'))
+            self._button = page.control(attribute(
+                ui.button('Set', on_click=self._submit).props('unelevated'), 'aria-label',
+                f'Set {title}'))
         self._slider = page.control(attribute(ui.slider(
             min=0.0, max=1.0, on_change=self._slid).props('color=grey-8'),
             'aria-label', f'{title}, slider'))
-        self._answer = AnswerLine()
-        self._field.on('keydown.enter', self._submit)
-        self._field.on('keydown.escape', self._reset)
+        self._answer = AnswerLine(page, lambda now: (
+            now.mode, present(now), now.silent(PLANT), now.silent(CONTROLLER)))
+        for control in (self._field, self._slider):
+            control.on('keydown.enter', self._submit)
+            control.on('keydown.escape', self._reset)
+        self._field.on('keydown.up.prevent', lambda: self._move(1.0), args=[])
+        self._field.on('keydown.down.prevent', lambda: self._move(-1.0), args=[])
 
-    def show(self, face: Faceplate, present: float) -> None:
-        """Follow the present value until a user types another one."""
+    def show(self, face: Faceplate, present: float, obstacle: str) -> None:
+        """
+        Follow the present value until a user types another one.
+
+        :param obstacle: why nothing can be sent, or empty.
+        """
+        self._decimals, self._step = face.decimals, 10.0 ** -face.decimals
         low, high = (round(end, face.decimals) for end in face.span)
-        if (low, high) != self._ends:
-            self._ends, step = (low, high), 10.0 ** -face.decimals
-            self._field.format = f'%.{face.decimals}f'
-            self._field.props['step'] = step
-            self._slider.props.update({'min': low, 'max': high, 'step': step})
-        if math.isfinite(present) and self._field.value == self._shown:
-            self._shown = round(present, face.decimals)
-            self._field.set_value(self._shown)
-            self._slider.set_value(self._shown)
+        found = {'min': low, 'max': high, 'step': self._step}
+        if any(self._slider.props.get(name) != value for name, value in found.items()):
+            self._slider.props.update(found)
+        for control in (self._field, self._button, self._slider):
+            self._page.allow(control, not obstacle, obstacle)
+        text = face.exact(present) if math.isfinite(present) else ''
+        if text and self._field.value in (self._shown, ''):
+            self._set(text)
+        self._shown = text
+        attribute(self._box, 'data-present', text)
+
+    def _set(self, text: str) -> None:
+        self._field.set_value(text)
 
     def _reset(self) -> None:
-        self._field.set_value(self._shown)
+        self._set(self._shown)
         self._answer.set_text('')
+
+    def _value(self) -> float | None:
+        try:
+            return parsed_number(str(self._field.value))
+        except ValueError:
+            return None
+
+    def _move(self, steps: float) -> None:
+        if (value := self._value()) is not None:
+            self._set(number(value + steps * self._step, self._decimals))
 
     def _slid(self, event: Any) -> None:
         # the slider keeps within its ends a value that was typed beyond them
-        typed, (low, high) = self._field.value, self._ends
-        if self._shown is not None and event.value != typed and (
-                typed is None or low <= typed <= high):
-            self._field.set_value(event.value)
+        low, high = self._slider.props['min'], self._slider.props['max']
+        value = self._value()
+        if self._shown and (value is None or low <= value <= high) and isinstance(
+                event.value, int | float) and (
+                    value is None or abs(event.value - value) >= 0.5 * self._step):
+            self._set(number(event.value, self._decimals))
 
-    def _typed(self, event: Any) -> None:
-        if event.value is not None and event.value != self._slider.value:
-            self._slider.set_value(event.value)
+    def _typed(self) -> None:
+        if (value := self._value()) is not None and value != self._slider.value:
+            self._slider.set_value(value)
 
     async def _submit(self) -> None:
-        value = self._field.value
-        if value is None:
-            self._answer.show(Answer(False, 'enter a number'))
+        try:
+            value = parsed_number(str(self._field.value))
+        except ValueError as error:
+            self._answer.show(Answer(False, str(error)))
             return
         self._answer.set_text('sent …')
-        self._answer.show(await self._send(float(value)))
+        self._answer.show(await self._send(value))
         # whatever the answer is, the field shows the present value again
-        self._shown = value
+        self._shown = str(self._field.value)
+
+
+async def _experiment_goes_on(page: PageLayout, signal: str) -> bool:
+    """Ask before an action that ends an experiment; return whether the action is dropped."""
+    now = page.source.snapshot
+    on = now.parameter(TRAINER, 'experiment_signal')
+    return bool(now.experiment and on == signal) and not await page.confirm(
+        'Abort the experiment?', 'Abort the experiment',
+        [f'An experiment is running, {now.experiment} s are left. It steps the {signal} itself, '
+         'and ends with this entry.'])
+
+
+def _show_value(element: ui.label, text: str, old: bool) -> None:
+    """Show a value, marked where the node that sends it is silent."""
+    element.set_text(f'? {text}' if old and text else text)
+    if old is not ('old' in element.classes):
+        element.classes(**{'add' if old else 'remove': 'old'})
 
 
 def _signal_card(face: Faceplate) -> Element:
@@ -162,11 +197,10 @@ def _signal_card(face: Faceplate) -> Element:
 
 
 def _state_card(page: PageLayout, at: int, face: StateFaceplate) -> None:
-    def present() -> float:
-        return page.source.snapshot.states[at].target
-
     async def send(value: float) -> Answer:
-        return await page.act('setpoint', face.name, value, present())
+        if await _experiment_goes_on(page, 'setpoint'):
+            return Answer(False, 'not sent: the experiment goes on')
+        return await page.act('setpoint', face.name, value, page.source.snapshot.states[at].target)
 
     with _signal_card(face):
         plate = _Faceplate(face, face.unit)
@@ -175,30 +209,31 @@ def _state_card(page: PageLayout, at: int, face: StateFaceplate) -> None:
                 label('span', 'set-point')
                 setpoint = label('span', '', 'value')
             target = label('div', '', 'quiet')
-            entry = _Entry(page, f'Set-point of {face.label}, {face.unit}', send)
+            entry = _Entry(page, f'Set-point of {face.label}, {face.unit}', send,
+                           lambda now: now.states[at].target)
         predicted = label('div', '', 'quiet')
 
     def show(now: Snapshot) -> None:
         own = now.states[at]
-        plate.show(own, own.measured, own.setpoint)
+        plate.show(own, own.measured, own.setpoint, 'measured' in own.old)
         if face.controlled:
-            setpoint.set_text(f'{own.text(own.setpoint)} {own.unit}')
+            _show_value(setpoint, f'{own.exact(own.setpoint)} {own.unit}', 'setpoint' in own.old)
             ramps = math.isfinite(own.target) and own.text(own.target) != own.text(own.setpoint)
-            target.set_text(f'target {own.text(own.target)} {own.unit} (ramping)' if ramps else '')
-            entry.show(own, own.target)
-        predicted.set_text(f'model prediction {number(own.predicted, own.decimals + 1)} {own.unit}'
-                           if math.isfinite(own.predicted) else
-                           'measured disturbance' if own.disturbance else '')
+            target.set_text(
+                f'target {own.exact(own.target)} {own.unit} (ramping)' if ramps else '')
+            entry.show(own, own.target, now.obstacle)
+        _show_value(predicted, f'model prediction {number(own.predicted, own.decimals + 1)} '
+                    f'{own.unit}' if math.isfinite(own.predicted) else
+                    'measured disturbance' if own.disturbance else '', 'predicted' in own.old)
 
     page.follow(show)
 
 
 def _input_card(page: PageLayout, at: int, face: InputFaceplate) -> None:
-    def present() -> float:
-        return page.source.snapshot.inputs[at].manual
-
     async def send(value: float) -> Answer:
-        return await page.act('manual', face.name, value, present())
+        if await _experiment_goes_on(page, 'manual'):
+            return Answer(False, 'not sent: the experiment goes on')
+        return await page.act('manual', face.name, value, page.source.snapshot.inputs[at].manual)
 
     with _signal_card(face):
         plate = _Faceplate(face, f'{face.unit} command')
@@ -207,12 +242,13 @@ def _input_card(page: PageLayout, at: int, face: InputFaceplate) -> None:
             applied = label('span', '', 'value')
         details = label('div', '', 'quiet')
         with box('') as manual:
-            entry = _Entry(page, f'Manual command: {face.label}, {face.unit}', send)
+            entry = _Entry(page, f'Manual command: {face.label}, {face.unit}', send,
+                           lambda now: now.inputs[at].manual)
 
     def show(now: Snapshot) -> None:
         own = now.inputs[at]
-        plate.show(own, own.command, own.applied)
-        applied.set_text(f'{own.text(own.applied)} {own.unit}')
+        plate.show(own, own.command, own.applied, 'command' in own.old)
+        _show_value(applied, f'{own.text(own.applied)} {own.unit}', 'applied' in own.old)
         limits = f'limits {own.span_text(own.limits)} {own.unit}' if own.limits else (
             'limits not known')
         change = own.disturbance
@@ -220,7 +256,7 @@ def _input_card(page: PageLayout, at: int, face: InputFaceplate) -> None:
             math.isfinite(change)) else ''
         details.set_text(limits + disturbance)
         show_if(manual, now.mode == 'manual')
-        entry.show(own, own.manual)
+        entry.show(own, own.manual, now.obstacle)
 
     page.follow(show)
 
@@ -233,7 +269,7 @@ def _simulation(page: PageLayout) -> None:
 
     with box('row1 hidden') as row:
         page.button('Reset the simulated plant …', reset)
-        answer = AnswerLine()
+        answer = AnswerLine(page)
     # the driver of a real plant is no node of ours
     page.follow(lambda now: show_if(row, f'{PLANT}: simulation' in now.statuses))
 
@@ -247,6 +283,10 @@ def _controller_card(page: PageLayout) -> None:
 
         async def switch() -> None:
             manual = page.source.snapshot.mode == 'manual'
+            if page.source.snapshot.experiment and not await page.confirm(
+                    'Abort the experiment?', 'Abort the experiment',
+                    ['An experiment is running, and ends with another mode.']):
+                return
             if manual or await page.confirm(
                     'Switch to manual mode?', 'Switch to manual mode',
                     ['The controller holds its last command until you enter another one. '
@@ -262,7 +302,7 @@ def _controller_card(page: PageLayout) -> None:
         button = page.button('', switch)
         with box('row1 hidden') as latched:
             page.button('Clear the safe state …', clear)
-        answer = AnswerLine()
+        answer = AnswerLine(page)
 
     def show(now: Snapshot) -> None:
         mode.set_text(now.mode or '–')

@@ -85,7 +85,7 @@ def comparison_card(page: PageLayout) -> None:
         with box('row1'):
             begin = page.button('Compare on the last hour', compare)
             end = page.button('Cancel', cancel)
-        answer = AnswerLine()
+        answer = AnswerLine(page)
         state = label('div', '').props('role=status')
         show_findings = _findings('comparison', 'Recorded commands and those of the new model')
     shown = [ReplayComparison()]

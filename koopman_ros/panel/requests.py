@@ -6,16 +6,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from enum import Enum
 import json
 import math
 from typing import Any
 
 TIMEOUT = 3.0  # s for the answer of a controller
 _SENTENCE = 1.5  # s until its status has the reason of a rejection
+UNKNOWN = 'unknown: '  #: prefix of an answer where a request may still be carried out
 REJECTED = 'request rejected: '  #: prefix of that status
 
 SETPOINT, MANUAL = 'setpoint', 'manual_command'  #: events of records
+
+
+class Role(Enum):
+    """Permissions of a user; the value is the word in the file."""
+
+    VIEWER = 'viewer'  #: sees all pages
+    OPERATOR = 'operator'  #: also operates the loop
+    ENGINEER = 'engineer'  #: also changes limits, laws, safe values and models
+
+    def includes(self, other: Role) -> bool:
+        """Return whether it has the permissions of another role."""
+        roles = list(Role)
+        return roles.index(self) >= roles.index(other)
 
 
 @dataclass(frozen=True)
@@ -31,6 +46,11 @@ class Action:
     old: Any = None
 
 
+def required_role(what: str) -> Role:
+    """Return the role that an action needs."""
+    return Role.ENGINEER if what in ('parameters', 'reload') else Role.OPERATOR
+
+
 @dataclass(frozen=True)
 class Answer:
     """Answer to an action."""
@@ -40,16 +60,34 @@ class Answer:
 
     def __str__(self) -> str:
         """Write the answer as the pages show it."""
-        return self.text if self.accepted or self.text.startswith('rejected') else (
+        return self.text if self.accepted or self.text.startswith(('rejected', UNKNOWN)) else (
             f'rejected: {self.text}')
 
 
-def action_text(action: Action, answer: Answer, stamp: float, unit: str = '') -> str:
-    """Return the line of JSON of an action; `unit` is that of its values."""
-    return json.dumps({'stamp': round(stamp, 3), 'who': action.who, 'what': ' '.join(
-        filter(None, (action.what, action.name))), 'old': _plain(action.old),
-        'new': _plain(action.value), **({'unit': unit} if unit else {}),
-        'accepted': answer.accepted, 'answer': answer.text}, allow_nan=False)
+@dataclass(frozen=True)
+class AuditEntry:
+    """An action with its answer, as the audit log has it."""
+
+    stamp: float  #: wall time
+    who: str
+    what: str
+    old: Any
+    new: Any
+    unit: str  #: of the values, or empty
+    accepted: bool
+    answer: str
+
+    @classmethod
+    def of(cls, action: Action, answer: Answer, stamp: float, unit: str = '') -> AuditEntry:
+        """Return the entry of an action; `unit` is that of its values."""
+        return cls(round(stamp, 3), action.who, ' '.join(filter(None, (action.what, action.name))),
+                   _plain(action.old), _plain(action.value), unit, answer.accepted, answer.text)
+
+    def text(self) -> str:
+        """Return the entry as a line of JSON."""
+        found = asdict(self)
+        return json.dumps({key: value for key, value in found.items() if key != 'unit' or value},
+                          allow_nan=False)
 
 
 def _plain(value: Any) -> Any:
@@ -68,6 +106,7 @@ class _Open:
     deadline: float
     reply: Callable[[Answer], None]
     accepted: str  # text of the answer if the request is accepted
+    who: str
     rejected: str = ''  # words of the code
 
 
@@ -83,27 +122,33 @@ class Requests:
                  words: Callable[[Sequence[str], str, float], str] = lambda *_: '') -> None:
         self._signals, self._words = signals, words
         self._open: list[_Open] = []
+        self._expected: dict[str, tuple[str, float]] = {}  # person and deadline, by event
 
     def add(self, event: str, name: str, value: float, now: float,
-            reply: Callable[[Answer], None], accepted: str = 'accepted') -> None:
+            reply: Callable[[Answer], None], accepted: str = 'accepted', who: str = '') -> None:
         """Wait for the answer to a value that was published."""
-        self._open.append(_Open(event, name, value, now + TIMEOUT, reply, accepted))
+        self._open.append(_Open(event, name, value, now + TIMEOUT, reply, accepted, who))
 
-    def take_record(self, event: str, fields: Mapping[str, Any], now: float) -> None:
-        """Take a record, which may answer a request."""
+    def expect(self, event: str, who: str, now: float) -> None:
+        """Expect a record of another kind, which a service of the controller causes."""
+        self._expected[event] = who, now + TIMEOUT
+
+    def take_record(self, event: str, fields: Mapping[str, Any], now: float) -> str:
+        """Take a record, which may answer a request; return who made it, or ''."""
         if event not in (SETPOINT, MANUAL):
-            return
+            who, until = self._expected.pop(event, ('', 0.0))
+            return who if now <= until else ''
         try:
             names = fields.get('signals') or self._signals[event]
             values = dict(zip(names, map(float, fields['value']), strict=True))
             accepted, codes = bool(fields['accepted']), tuple(map(str, fields['reason']))
         except (KeyError, TypeError, ValueError):
-            return
+            return ''
         request = next((one for one in self._open if one.event == event and not one.rejected
                         and math.isclose(values.get(one.name, math.nan), one.value,
                                          rel_tol=1e-9, abs_tol=1e-12)), None)
         if request is None:
-            return
+            return ''
         if accepted:
             self._answer(request, Answer(True, request.accepted))
         elif words := self._words(codes, request.name, request.value):
@@ -112,6 +157,7 @@ class Requests:
             # the sentence follows with the next status
             request.rejected = ', '.join(code.replace('_', ' ') for code in codes) or 'rejected'
             request.deadline = now + _SENTENCE
+        return request.who
 
     def take_status(self, message: str) -> None:
         """Take the message of the controller's status, perhaps with the reason of a rejection."""
@@ -123,7 +169,8 @@ class Requests:
         """Answer the requests for which the controller has no answer in time."""
         for request in [one for one in self._open if now > one.deadline]:
             self._answer(request, Answer(False, request.rejected or (
-                f'the controller did not answer within {TIMEOUT:g} s: check its log')))
+                f'{UNKNOWN}the controller did not answer within {TIMEOUT:g} s: check the value '
+                'shown, and its log')))
 
     def _answer(self, request: _Open, answer: Answer) -> None:
         self._open.remove(request)

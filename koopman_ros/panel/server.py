@@ -24,7 +24,8 @@ import uvicorn
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from koopman_ros.panel.access import Users
-from koopman_ros.panel.alarm_page import alarm_page
+from koopman_ros.panel.alarm_page import alarm_page, alarm_strip
+from koopman_ros.panel.audit_page import audit_page
 from koopman_ros.panel.connections import BACKLOG, Listener, RateLimiter
 from koopman_ros.panel.layout import PageLayout, Source
 from koopman_ros.panel.login import AccessControl, add_login
@@ -51,7 +52,7 @@ _HEADERS = (
      b"frame-ancestors 'none'; form-action 'self'; base-uri 'self'"))
 _PAGES: dict[str, Callable[[PageLayout], None]] = {
     '/': overview, '/trends': trend_page, '/alarms': alarm_page, '/model': model_page,
-    '/tuning': tuning_page}
+    '/tuning': tuning_page, '/audit': audit_page}
 
 
 class _AuthMiddleware:
@@ -135,12 +136,13 @@ class PanelServer:
 
     :param users: file of users, empty for none.
     :param proxies: addresses and networks of trusted proxies, empty for none.
+    :param command_timeout: s after which a press on a page is refused.
     :raises ValueError: for an address that needs users, or a wrong file.
     :raises OSError: for an address in use.
     """
 
     def __init__(self, source: Source, host: str, port: int, users: str, certificate: str,
-                 key: str, proxies: Sequence[str] = ()) -> None:
+                 key: str, proxies: Sequence[str] = (), command_timeout: float = 5.0) -> None:
         try:
             found = Users.read(users) if users else None
         except OSError as error:
@@ -164,7 +166,7 @@ class PanelServer:
         ui.run_with(app, title='panel', favicon='⚙', binding_refresh_interval=None,
                     show_welcome_message=False, tailwind=False, reconnect_timeout=10.0)
         app.add_middleware(_AuthMiddleware, keeper=keeper, listener=self._socket)
-        _guard_sockets(keeper)
+        _guard_sockets(keeper, command_timeout)
         # browsers send the cookies of a host to all its ports, and a proxy may serve several hosts
         machine = zlib.crc32(socket.gethostname().encode())
         served = _with_sessions(app, f'koopman_panel_{port}_{machine:08x}',
@@ -240,6 +242,7 @@ def _add_page(path: str, fill: Callable[[PageLayout], None], source: Source, kee
     @ui.page(path)
     def build(request: Request) -> None:
         page = PageLayout(source, keeper.visitor(request.scope), path)
+        alarm_strip(page)
         fill(page)
         page.run()
 
@@ -252,8 +255,13 @@ def _add_pictures(app: FastAPI, source: Source) -> None:
         return Response(found, 200 if found else 404, {'cache-control': 'no-store'}, 'image/png')
 
 
-def _guard_sockets(keeper: AccessControl) -> None:
-    """Let a socket act on pages of its own session: NiceGUI checks the id of a page alone."""
+def _guard_sockets(keeper: AccessControl, command_timeout: float) -> None:
+    """
+    Let a socket act on pages of its own session: NiceGUI checks the id of a page alone.
+
+    A press on a page carries the panel's time that the page showed. One that was on its way for
+    too long is refused, and the page is told.
+    """
     sockets = core.sio
 
     def own(scope: Any, client_id: Any) -> bool:
@@ -286,9 +294,24 @@ def _guard_sockets(keeper: AccessControl) -> None:
 
         return on_message
 
+    async def on_event(sid: str, message: Any) -> None:
+        if not own(sockets.get_environ(sid)['asgi.scope'], named(message)):
+            return
+        if isinstance(press := message.get('press'), dict):
+            try:
+                late = not time.monotonic() - float(press['seen']) <= command_timeout
+            except (LookupError, TypeError, ValueError):
+                late = True
+            await sockets.emit('pressed', {'id': press.get('id'), 'late': late}, to=sid)
+            if late:
+                return
+        sockets_handle(sid, message)
+
+    sockets_handle = sockets.handlers['/']['event']
+    sockets.on('event', on_event)
     sockets.on('connect', on_connect)
     sockets.on('handshake', on_handshake)
-    for name in ('event', 'javascript_response', 'ack'):
+    for name in ('javascript_response', 'ack'):
         sockets.on(name, guarded(sockets.handlers['/'][name]))
     # browsers cannot write to the log of the panel
     sockets.on('log', lambda sid, message: None)

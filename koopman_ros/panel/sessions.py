@@ -14,7 +14,8 @@ from limits import parse, RateLimitItem
 from limits.storage import MemoryStorage
 from limits.strategies import FixedWindowRateLimiter
 
-from koopman_ros.panel.access import normalised, Role
+from koopman_ros.panel.access import normalised
+from koopman_ros.panel.requests import Role
 
 MAX_SESSIONS_OF_A_USER = 20
 _MAX_KNOWN = 10_000  # names with the addresses from which they logged in

@@ -11,14 +11,20 @@ from types import MappingProxyType
 from typing import Any
 
 from koopman_ros.panel.alarms import Alarm
-from koopman_ros.panel.faceplates import InputFaceplate, StateFaceplate
+from koopman_ros.panel.faceplates import (
+    CONTROLLER,
+    InputFaceplate,
+    PLANT,
+    StateFaceplate,
+    TRAINER,
+)
 from koopman_ros.parameters.description import ParameterDescription
 
 OK, WARN, ERROR = 0, 1, 2  #: levels of a status
-PLANT, CONTROLLER, TRAINER = 'plant', 'controller', 'trainer'  #: roles of nodes
+PANEL = 'panel'  #: role of the panel itself, for its parameters
 ROLES: Mapping[str, str] = MappingProxyType({role: role for role in (PLANT, CONTROLLER, TRAINER)})
 CONTROL, REQUESTS = f'{CONTROLLER}: control', f'{CONTROLLER}: requests'
-MEASUREMENTS = f'{CONTROLLER}: measurements'
+MEASUREMENTS, CONNECTIONS = f'{CONTROLLER}: measurements', f'{CONTROLLER}: connections'
 TRAINING, RECORDING = f'{TRAINER}: training', f'{TRAINER}: recording'
 EXPERIMENT = f'{TRAINER}: experiment'
 LOST = 'connection lost'  #: message of a silent node
@@ -60,6 +66,7 @@ class Snapshot:
     statuses: Mapping[str, TaskStatus]
     standing: tuple[Alarm, ...]  #: alarms, the most urgent first
     shelved: tuple[Alarm, ...]
+    stale: frozenset[str]  #: keys of alarms whose nodes no longer report them
     silences: tuple[SilentTopic, ...]
     parameters: Mapping[str, Mapping[str, ParameterDescription]]  #: by role
     model: Mapping[str, str]  #: origin and held-out figures of the current model
@@ -71,6 +78,22 @@ class Snapshot:
         lost = any(one.seen and one.role == name.partition(':')[0] != PLANT
                    for one in self.silences)
         return replace(found, level=ERROR, message=LOST) if lost else found
+
+    @property
+    def experiment(self) -> str:
+        """Time left of an experiment that runs, in s; empty for none."""
+        left = self.status(EXPERIMENT).values.get('left [s]', '0')
+        return '' if left == '0' or self.silent(TRAINER) else left
+
+    @property
+    def obstacle(self) -> str:
+        """Why the loop cannot be operated, or empty."""
+        silent = [role for role in (PLANT, CONTROLLER) if self.silent(role)]
+        return f'no message from the {" and the ".join(silent)}' if silent else ''
+
+    def silent(self, role: str) -> bool:
+        """Return whether a node sends nothing."""
+        return any(one.role == role for one in self.silences)
 
     def parameter(self, role: str, name: str) -> Any:
         """Return the value of a parameter of a node, None for an unknown one."""

@@ -20,7 +20,7 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.panel.faceplates import Faceplate, InputFaceplate, pen, Range, StateFaceplate
 from koopman_ros.panel.layout import PageLayout
 from koopman_ros.panel.snapshot import Snapshot
-from koopman_ros.panel.trends import grouped, MarkGroup
+from koopman_ros.panel.trends import grouped, MarkGroup, TrendMark
 
 #: length and period of the updates in s
 SPANS = {'10 min': (600.0, 1.0), '1 h': (3600.0, 2.0), '8 h': (28800.0, 5.0)}
@@ -87,7 +87,7 @@ class TrendChart:
         self._charts = _charts(page.source.snapshot)
         self._span, self._whole, self._due, self._zoomed = '10 min', False, 0.0, _ALL
         self._end: float | None = None
-        self.marks: Sequence[MarkGroup] = ()  #: events in the time shown
+        self.marks: Sequence[TrendMark] = ()  #: events in the time shown
         self._chart = ui.echart(_options(self._charts, height, zoom)).props(
             'aria-label="Trends of all signals" role=img')
         self._chart.classes('trends').style(';'.join(
@@ -139,8 +139,9 @@ class TrendChart:
             if own.kind == 'planned':
                 times, plan = np.reshape(faces[own.signal].plan, (-1, 2)).T
                 values[own.key] = times, plan
-        self.marks = grouped(trends.marks(begin, end), _GROUP * (last - first))
-        marks = [replace(mark, time=mark.time + zone) for mark in self.marks]
+        self.marks = trends.marks(begin, end)
+        marks = [replace(mark, time=mark.time + zone) for mark in grouped(
+            self.marks, _GROUP * (last - first))]
         self._chart.run_chart_method('setOption', {
             'useUTC': True,
             # without a plan there is no line

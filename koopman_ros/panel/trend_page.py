@@ -47,7 +47,8 @@ def trend_page(page: PageLayout) -> None:
         events.clear()
         with events:
             for mark in reversed(chart.marks):
-                label('div', f'{_clock(mark.time)}  {mark.text}').props('role=listitem')
+                label('div', f'{_clock(mark.time)}  {mark.kind}: {mark.text}').props(
+                    'role=listitem')
             if not chart.marks:
                 label('div', 'none in this period', 'quiet')
 

@@ -13,11 +13,12 @@ from typing import Any
 
 from nicegui import ui
 
-from koopman_ros.core.units import ZERO_CELSIUS
+from koopman_ros.core.units import printed, ZERO_CELSIUS
+from koopman_ros.panel.faceplates import readable
 from koopman_ros.panel.files import sanitize_text
 from koopman_ros.panel.layout import AnswerLine, attribute, box, label, PageLayout
 from koopman_ros.panel.requests import Answer
-from koopman_ros.panel.snapshot import CONTROLLER, Snapshot, TRAINER
+from koopman_ros.panel.snapshot import CONTROLLER, PANEL, Snapshot, TRAINER
 from koopman_ros.parameters.description import ParameterDescription
 from koopman_ros.parameters.table import as_yaml, UNBOUNDED
 
@@ -29,7 +30,7 @@ _MAX_UNIT = 60  # characters
 def tuning_page(page: PageLayout) -> None:
     """Build the page."""
     with page.body:
-        for node in (CONTROLLER, TRAINER):
+        for node in (CONTROLLER, TRAINER, PANEL):
             _node(page, node)
 
 
@@ -67,7 +68,7 @@ def _groups(page: PageLayout, node: str, found: Mapping[str, ParameterDescriptio
         groups.setdefault(name.rpartition('.')[0] or _GENERAL, []).append(one)
     rows = {}
     for group, members in sorted(groups.items(), key=lambda item: item[0] != _GENERAL):
-        with ui.expansion(group.replace('_', ' ')).props('dense switch-toggle-side'):
+        with ui.expansion(readable(group)).props('dense switch-toggle-side'):
             for one in sorted(members, key=lambda one: one.read_only):
                 rows[one.name] = _Row(page, node, one)
     return rows
@@ -96,10 +97,10 @@ class _Row:
                         type(parameter.value))
                     self._field = page.control(attribute(
                         (ui.select(list(choices)) if choices else ui.input()).props(
-                            'outlined dense'), 'aria-label', title))
-                    attribute(page.button('Set', self._submit), 'aria-label',
+                            'outlined dense'), 'aria-label', title), 'parameters')
+                    attribute(page.button('Set', self._submit, 'parameters'), 'aria-label',
                               f'Set {parameter.name}')
-                self._answer = AnswerLine()
+                self._answer = AnswerLine(page, lambda now: now.parameter(node, parameter.name))
                 self._field.on('keydown.enter', self._submit)
                 self._field.on('keydown.escape', self._reset)
 
@@ -126,12 +127,20 @@ class _Row:
         except ValueError as error:
             self._answer.show(Answer(False, str(error)))
             return
+        now = replace(self._parameter, value=value)
+        unit = f' {printed(now.unit)}' if now.unit else ''
+        if not await self._page.confirm(
+                f'Change {name}?', 'Change', [now.meaning, _range(now)],
+                [('', 'now', 'new'),
+                 (name, f'{self._parameter.text}{unit}', f'{now.text}{unit}')]):
+            self._answer.set_text('not changed')
+            return
         self._answer.set_text('sent …')
         answer = await self._page.act('parameters', self._node, {name: value},
                                       {name: self._parameter.value})
         if answer.accepted:
             # the new value stays in the field until the node publishes it
-            self._text = replace(self._parameter, value=value).text
+            self._text = now.text
         self._answer.show(answer)
 
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 import math
 from pathlib import Path
@@ -17,6 +18,7 @@ from koopman_ros.core.status import level_words
 from koopman_ros.core.units import conversion, display_unit, printed
 from koopman_ros.panel.conditions import Conditions
 from koopman_ros.panel.faceplates import pen, Range, readable, SignalValues
+from koopman_ros.panel.requests import AuditEntry
 from koopman_ros.panel.snapshot import CONTROL, CONTROLLER, OK, PLANT, ROLES, Snapshot, TaskStatus
 from koopman_ros.panel.trends import Trends
 from koopman_ros.parameters.description import ParameterDescription
@@ -29,6 +31,7 @@ _OF_LIMITS: Mapping[tuple[str, float], str] = {
     ('range', -1.0): 'at its lower limit', ('range', 1.0): 'at its upper limit',
     ('rate', -1.0): 'at its rate limit (falling)', ('rate', 1.0): 'at its rate limit (rising)',
     ('limit', -1.0): 'kept above its lower limit', ('limit', 1.0): 'kept below its upper limit'}
+MAX_AUDIT = 5000  #: actions that are kept
 _UNPLANNED = 3  # answers without a plan end the last plan: one message may be lost
 
 
@@ -36,7 +39,8 @@ class LoopViewModel:
     """
     State of a loop as far as it was received.
 
-    All methods are called from one thread; :attr:`trends` and :attr:`alarms` from any.
+    All methods are called from one thread; :attr:`trends`, :attr:`alarms` and :attr:`audit` from
+    any.
 
     :param signals: of the plant.
     :param read: units in which people read them, by name.
@@ -65,6 +69,16 @@ class LoopViewModel:
         self._about: Mapping[str, str] = MappingProxyType({})
         self._previous_model = ''
         self._model: dict[str, Any] = {}
+        self._audit: deque[AuditEntry] = deque(maxlen=MAX_AUDIT)
+
+    @property
+    def audit(self) -> tuple[AuditEntry, ...]:
+        """The last actions of operators."""
+        return tuple(self._audit)
+
+    def take_action(self, entry: AuditEntry) -> None:
+        """Take an action of an operator with its answer."""
+        self._audit.append(entry)
 
     # Messages.
 
@@ -148,18 +162,23 @@ class LoopViewModel:
         for name, own in self._all.items():
             own.active = ', '.join(words.get(name, ()))
 
-    def take_record(self, event: str, fields: Mapping[str, Any], now: float) -> None:
-        """Take a record of the controller's event log; a malformed one is ignored."""
+    def take_record(self, event: str, fields: Mapping[str, Any], now: float, who: str = ''
+                    ) -> None:
+        """
+        Take a record of the controller's event log; a malformed one is ignored.
+
+        :param who: operator who caused it, or empty.
+        """
         self.conditions.take_message(CONTROLLER, now)
         if event == 'measurement':
             # one that is reported on change may stand for many
             self.conditions.take_message(PLANT, now)
         try:
-            self._take_event(event, fields)
+            self._take_event(event, fields, f' by {who}' if who else '')
         except (AttributeError, KeyError, TypeError, ValueError):
             return
 
-    def _take_event(self, event: str, fields: Mapping[str, Any]) -> None:
+    def _take_event(self, event: str, fields: Mapping[str, Any], by: str) -> None:
         match event:
             case 'measurement' | 'silence':
                 mode, level = str(fields['mode']), str(fields['level'])
@@ -174,25 +193,26 @@ class LoopViewModel:
                 names = fields.get('signals') or self.signals.controlled
                 for name, value in zip(names, fields['value'], strict=True):
                     own = self._states[name]
-                    own.values['target'] = own.shown(value)
-                    self._mark('set-point', f'{readable(name)} {own.values["target"]:.6g} '
-                                           f'{printed(own.read)}')
+                    self._change('set-point', own, 'target', own.shown(value), by)
             case 'manual_command' if fields['accepted']:
                 for own, value in zip(self._inputs.values(), fields['value'], strict=True):
-                    own.values['manual'] = self.limited(own.name, own.shown(value))
-                self._mark('manual', 'manual command')
+                    self._change('manual', own, 'manual',
+                                 self.limited(own.name, own.shown(value)), by)
             case 'mode':
-                self._mode = str(fields['mode'])
+                before, self._mode = self._mode, str(fields['mode'])
                 self._forget('manual')
-                self._mark('mode', f'{self._mode} mode')
+                self._mark('mode', f'{before} → {self._mode}{by}' if before else
+                           f'{self._mode}{by}')
             case 'model':
-                self._mark('model', f'model {fields["model"]["name"]}')
-                self._replace_model(fields['model'])
+                self._replace_model(fields['model'], by)
             case 'parameters':
-                self._mark('model' if 'model' in fields else 'parameter',
-                           ', '.join(map(str, fields['parameters'])))
+                if changes := ', '.join(
+                        f'{name}: {found.text if (found := known.get(name)) else "–"} → {value}'
+                        for known in [self._parameters.get(CONTROLLER, {})]
+                        for name, value in dict(fields['parameters']).items()):
+                    self._mark('parameter', f'{changes}{by}')
                 if 'model' in fields:
-                    self._replace_model(fields['model'])
+                    self._replace_model(fields['model'], by)
             case 'start' | 'snapshot':
                 if event == 'start':
                     self._forget('manual', 'target')
@@ -204,8 +224,17 @@ class LoopViewModel:
             for kind in kinds:
                 own.values.pop(kind, None)
 
-    def _replace_model(self, model: Mapping[str, Any]) -> None:
+    def _change(self, mark: str, own: SignalValues, kind: str, value: float, by: str) -> None:
+        """Take a value that was asked for, and mark its change in the trends."""
+        fallback = own.get('active_setpoints' if kind == 'target' else 'commands')
+        before, own.values[kind] = own.get(kind, fallback), value
+        if before != value:
+            self._mark(mark, f'{readable(own.name)} {before:.6g} → {value:.6g} '
+                             f'{printed(own.read)}{by}')
+
+    def _replace_model(self, model: Mapping[str, Any], by: str) -> None:
         before, self._model = self._model, dict(model)
+        self._mark('model', f'{before.get("name", "–")} → {model["name"]}{by}')
         if not before or before['digest'] == model['digest']:
             return
         name = str(before['name'])
@@ -254,12 +283,15 @@ class LoopViewModel:
     def snapshot(self, now: float) -> Snapshot:
         """Return the state at this instant."""
         silences = self.conditions.silences(now)
-        no_plant, no_controller = (any(one.role == role for one in silences)
-                                   for role in (PLANT, CONTROLLER))
+        silent = {one.role for one in silences}
+        no_controller = CONTROLLER in silent
         control = self.conditions.statuses.get(CONTROL, TaskStatus(CONTROL, OK, ''))
         levels = self._parameters.get(CONTROLLER, {}).get('fallback_order')
         best = str(levels.value[0]) if levels else 'sdre'
         reason = control.values.get('reason', 'none')
+        rejected, uncertain = (control.values.get(f'{quality} measurements', '').split(', ')
+                               for quality in ('rejected', 'uncertain'))
+        quality = {**dict.fromkeys(uncertain, 'uncertain'), **dict.fromkeys(rejected, 'rejected')}
         return Snapshot(
             plant=self.conditions.plant, wall=now, time=self._time,
             mode='' if no_controller else self._mode,
@@ -267,13 +299,15 @@ class LoopViewModel:
             fallback=bool(self._level) and self._level not in (best, 'manual'),
             reason='' if reason == 'none' or no_controller else reason,
             states=tuple(own.state(name in self.signals.controlled, self._bounds(own, 'mpc.{}.{}'),
-                                   self._bounds(own, '{}.sensor_{}'), no_plant,
+                                   self._bounds(own, '{}.sensor_{}'), silent,
+                                   '' if no_controller else quality.get(name, ''),
                                    name in self._disturbances)
                          for name, own in {**self._states, **self._disturbances}.items()),
-            inputs=tuple(own.input(self._bounds(own), no_controller)
+            inputs=tuple(own.input(self._bounds(own), silent, self._level)
                          for own in self._inputs.values()),
             estimates=self._estimates, statuses=MappingProxyType(dict(self.conditions.statuses)),
-            standing=self.alarms.standing, shelved=self.alarms.shelved, silences=silences,
+            standing=self.alarms.standing, shelved=self.alarms.shelved,
+            stale=self.conditions.stale(now), silences=silences,
             parameters=MappingProxyType(dict(self._parameters)), model=self._about,
             previous_model=self._previous_model)
 

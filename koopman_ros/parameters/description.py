@@ -4,7 +4,30 @@
 """A parameter of another node, as that node describes it."""
 
 from dataclasses import dataclass
+import re
 from typing import Any
+
+_THOUSANDS = re.compile(r'[-+]?[1-9]\d{0,2},\d{3}')
+
+
+def parsed_number(text: str) -> float:
+    """
+    Return the number in a text, which may have a decimal comma.
+
+    >>> parsed_number('45,5')
+    45.5
+
+    :raises ValueError: for another text, and where a comma may separate thousands.
+    """
+    text = text.strip()
+    if _THOUSANDS.fullmatch(text) or text.count(',') > 1 or (',' in text and '.' in text):
+        raise ValueError(f'{text} can be read in two ways: write a decimal point, and no '
+                         'separator of thousands')
+    try:
+        return float(text.replace(',', '.'))
+    except ValueError:
+        raise ValueError(f'{text!r} is not a number') from None
+
 
 
 @dataclass(frozen=True)
@@ -38,12 +61,13 @@ class ParameterDescription:
             if text.lower() not in ('true', 'false'):
                 raise ValueError('write true or false')
             return text.lower() == 'true'
-        if isinstance(self.value, (int, float)):
+        if isinstance(self.value, int):
             try:
-                return type(self.value)(text.replace(',', '.'))
+                return int(text)
             except ValueError:
-                kind = 'a whole number' if isinstance(self.value, int) else 'a number'
-                raise ValueError(f'{text!r} is not {kind}') from None
+                raise ValueError(f'{text!r} is not a whole number') from None
+        if isinstance(self.value, float):
+            return parsed_number(text)
         if isinstance(self.value, tuple):
             parts = tuple(part.strip() for part in text.strip('[]').split(','))
             if not self.value or not isinstance(self.value[0], float):

@@ -63,7 +63,8 @@ class PanelParameters(SignalParameters):
     trainer: str = parameter(
         'trainer', 'Name of the trainer node.', read_only=True)
     title: str = parameter(
-        '', 'Title of all pages; empty: the name of the plant.', read_only=True)
+        '', 'Title of all pages; empty: the namespace and the name of the plant.',
+        read_only=True)
     host: str = parameter(
         '127.0.0.1', 'Address of the web server. Users are required unless it is a loopback '
                      'address.',
@@ -83,6 +84,9 @@ class PanelParameters(SignalParameters):
     alarm_file: str = parameter(
         '', 'File that keeps alarms, shelving and the last 24 hours across restarts; empty: '
             'none.', read_only=True)
+    command_timeout: float = parameter(
+        5.0, 'Longest time from what a page showed when a control was pressed to its arrival; a '
+             'later press is refused.', 's', 1.0, 60.0, read_only=True)
     span: float = parameter(
         28800.0, 'Length of the trends.', 's', 600.0, 604800.0, read_only=True)
     states: Mapping[str, ShownState] = per_signal(ShownState)

@@ -13,7 +13,7 @@ from koopman_ros.control import Arrival, Controller, HOLD, Mode, SAFE, State, St
 from koopman_ros.control.state import TargetReport
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import base_name
-from koopman_ros.core.status import level_words, StatusCode
+from koopman_ros.core.status import level_words, Reason, StatusCode
 from koopman_ros.core.synchronizer import SampleSynchronizer
 from koopman_ros.core.time_base import Advance
 from koopman_ros.core.units import display_unit, quantity_text, shown, values_by_name
@@ -362,11 +362,24 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
         **{f'{what} messages of {name}': count for what, counts in (
             ('late', now.assembler.late), ('missing', now.assembler.missing),
             ('duplicate', now.assembler.duplicated)) for name, count in counts.items()},
+        # signals whose value is not used, or not as it is
+        'rejected measurements': ', '.join(
+            _signals_of(report.reason)
+            if report.measurement.arrival is Arrival.REJECTED else ()) or 'none',
+        'uncertain measurements': ', '.join(report.measurement.uncertain) or 'none',
         'since last measurement [s]': timing.wall_silence,
         'age of measurement [s]': timing.age,
         'latency from stamp to command [s]': timing.age + timing.answer_seconds,
         'latency from arrival to command [s]': timing.answer_seconds,
     }
+
+
+def _signals_of(why: Reason | None) -> Iterator[str]:
+    """Yield the signals of a reason, and of those behind it."""
+    while why is not None:
+        if 'signal' in why.values:
+            yield str(why.values['signal'])
+        why = why.cause
 
 
 def _estimated(now: StatusContext) -> dict[str, object]:

@@ -72,7 +72,7 @@ def get(url: str, data: bytes | None = None, trusting: ssl.SSLContext | None = N
 def test_pages_are_served_to_this_machine_alone_and_a_port_only_once(
         ros: Harness, capfd: pytest.CaptureFixture[str]) -> None:
     url = address(ros, ros.start('panel', {'port': 0}))
-    for path in ('/', '/trends', '/alarms', '/model', '/tuning'):
+    for path in ('/', '/trends', '/alarms', '/model', '/tuning', '/audit'):
         status, text, headers = get(f'{url}{path}')
         assert status == 200
         assert not re.findall(r'(?:src|href)="?(?:https?:)?//', text)

@@ -12,7 +12,8 @@ from argon2 import PasswordHasher
 import pytest
 
 from koopman_ros.panel import access
-from koopman_ros.panel.access import hashed, main, Role, Users, write_user
+from koopman_ros.panel.access import hashed, main, Users, write_user
+from koopman_ros.panel.requests import Role
 
 PASSWORD = 'correct horse'
 # hashes that are quick to verify, the same in all processes

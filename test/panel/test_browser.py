@@ -458,7 +458,7 @@ def test_a_viewer_on_a_phone_sees_operator_actions_and_cannot_act(site: Site) ->
         expect(ask_setpoint(desk, '48')).to_have_text('accepted')
         expect(face(page, 'temperature').locator('.value')).to_have_text('48.0 °C')
         expect(asked(page)).to_have_value('48.0')
-        for path in ('/', '/trends', '/alarms', '/model', '/tuning'):
+        for path in ('/', '/trends', '/alarms', '/model', '/tuning', '/audit'):
             if path != '/':
                 page.goto(f'{site.url}{path}')
                 page.wait_for_selector('#beat[data-beat]')

@@ -13,20 +13,21 @@ from nicegui.page import page
 import pytest
 import yaml
 
-from koopman_ros.panel.alarm_page import alarm_page
+from koopman_ros.panel.alarm_page import alarm_page, alarm_strip
+from koopman_ros.panel.audit_page import audit_page
 from koopman_ros.panel.layout import attribute, PageLayout, Visitor
 from koopman_ros.panel.model_page import model_page
 from koopman_ros.panel.overview import overview
-from koopman_ros.panel.requests import Answer
+from koopman_ros.panel.requests import Answer, Role
 from koopman_ros.panel.trend_page import trend_page
 from koopman_ros.panel.tuning_page import exported, tuning_page
 from support.hostile import CODE, HostileSource, TEXTS
 
 PAGES = {'/': overview, '/trends': trend_page, '/alarms': alarm_page, '/model': model_page,
-         '/tuning': tuning_page}
+         '/tuning': tuning_page, '/audit': audit_page}
 #: values of props that are shown as text, or are names of things of the page itself
-TEXT_PROPS = {'alt', 'aria-label', 'data-parameter', 'data-signal', 'label', 'model-value',
-              'value', 'options'}
+TEXT_PROPS = {'alt', 'aria-label', 'data-parameter', 'data-signal', 'data-title', 'label',
+              'model-value', 'value', 'options'}
 
 
 @pytest.fixture
@@ -49,12 +50,13 @@ def keys_and_texts(value: Any) -> Iterator[tuple[str, Any]]:
             yield from keys_and_texts(item)
 
 
-@pytest.mark.parametrize('may_act', [True, False], ids=['operator', 'viewer'])
+@pytest.mark.parametrize('role', Role)
 @pytest.mark.parametrize('path', PAGES)
 def test_hostile_texts_of_all_sources_stay_texts(
-        client: Client, path: str, may_act: bool) -> None:
+        client: Client, path: str, role: Role) -> None:
     source = HostileSource()
-    layout = PageLayout(source, Visitor(TEXTS[0], lambda: may_act), path)
+    layout = PageLayout(source, Visitor(TEXTS[0], lambda: role), path)
+    alarm_strip(layout)
     PAGES[path](layout)
     layout.update()
     shown = 0
@@ -80,7 +82,7 @@ def test_hostile_texts_of_all_sources_stay_texts(
 
 
 def test_chart_tooltips_escape_markup(client: Client) -> None:
-    trend_page(PageLayout(HostileSource(), Visitor('anna', lambda: True), '/trends'))
+    trend_page(PageLayout(HostileSource(), Visitor('anna', lambda: Role.ENGINEER), '/trends'))
     (chart,) = (own for own in client.elements.values() if isinstance(own, ui.echart))
     assert chart.options['tooltip']['renderMode'] == 'richText'
 
@@ -88,7 +90,7 @@ def test_chart_tooltips_escape_markup(client: Client) -> None:
 def test_the_tasks_of_a_closed_page_end(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     source, waiting = HostileSource(), Future[Answer]()
     monkeypatch.setattr(source, 'request', lambda _: waiting)
-    layout = PageLayout(source, Visitor('anna', lambda: True), '/')
+    layout = PageLayout(source, Visitor('anna', lambda: Role.ENGINEER), '/')
 
     async def closed() -> None:
         task = asyncio.ensure_future(layout.act('train'))

@@ -12,13 +12,12 @@ import json
 import logging
 import math
 import os
-from pathlib import Path
 import re
 import resource
 import socket
 import threading
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from urllib.parse import urlencode
 
 from nicegui import Client
@@ -34,9 +33,9 @@ from koopman_ros.panel.layout import clock
 from koopman_ros.panel.server import PanelServer
 from koopman_ros.panel.trend_chart import axis_ends, ink, legend_rows, zoomed
 from koopman_ros.panel.trend_page import time_of_day
-from support.browser import opened_browser, Pages, PATIENCE
+from support.browser import Pages, PATIENCE
 from support.hostile import HostileSource, NOW, TEXTS
-from support.users import PASSWORDS, write_users
+from support.users import PASSWORDS
 
 # NiceGUI looks through all objects of the process for its server, also those of torch where
 # another test has imported it.
@@ -54,13 +53,11 @@ class Answered(NamedTuple):
 
 
 class Site:
-    """A panel with users, in a thread of this process: it can be there only once."""
+    """A panel with users, in a thread of this process."""
 
-    def __init__(self, folder: Path) -> None:
-        self.source = HostileSource()
-        self.server = PanelServer(self.source, '127.0.0.1', 0, str(write_users(folder / 'users')),
-                                  '', '', [PROXY])
-        self.server.start()
+    def __init__(self, served: Any) -> None:
+        self.source = served.loop = HostileSource()
+        self.server: PanelServer = served.server
         self.url = self.server.address
         self.port = int(self.url.rpartition(':')[2])
 
@@ -86,16 +83,8 @@ class Site:
 
 
 @pytest.fixture(scope='module')
-def browser() -> Iterator[Pages]:
-    with opened_browser() as own:
-        yield own
-
-
-@pytest.fixture(scope='module')
-def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    own = Site(tmp_path_factory.mktemp('server'))
-    yield own
-    own.server.stop()
+def site(served: Any) -> Site:
+    return Site(served)
 
 
 def forwarded(client: str, scheme: str = 'https') -> dict[str, str]:
@@ -360,7 +349,7 @@ def log_in(page: Page, site: Site) -> None:
 def test_no_text_from_outside_runs_in_the_browser(site: Site, browser: Pages) -> None:
     with browser.page('about:blank') as page:
         log_in(page, site)
-        for path in ('/', '/trends', '/alarms', '/model', '/tuning'):
+        for path in ('/', '/trends', '/alarms', '/model', '/tuning', '/audit'):
             page.goto(f'{site.url}{path}')
             page.wait_for_selector('#beat[data-beat]')
             page.locator('.q-expansion-item .q-item:visible').evaluate_all(

@@ -8,8 +8,8 @@ import time
 
 import pytest
 
-from koopman_ros.panel.access import Role
 from koopman_ros.panel.origins import is_loopback, rejection
+from koopman_ros.panel.requests import Role
 from koopman_ros.panel.sessions import MAX_SESSIONS_OF_A_USER, Sessions, Throttle
 
 

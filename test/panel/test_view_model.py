@@ -16,11 +16,11 @@ import pytest
 from koopman_ros.core.units import display_unit, to_kelvin
 from koopman_ros.panel.alarms import AlarmState, Priority
 from koopman_ros.panel.faceplates import pen, span_text
-from koopman_ros.panel.model_page import experiment_obstacle, experiment_running
+from koopman_ros.panel.model_page import experiment_obstacle
 from koopman_ros.panel.requests import (
     Action,
-    action_text,
     Answer,
+    AuditEntry,
     MANUAL,
     Requests,
     SETPOINT,
@@ -377,8 +377,8 @@ def test_silence_and_levels_are_alarms_by_priority_and_marks() -> None:
         status(own, 'other', ERROR, 'is down', {}, NOW + second)
         own.advance(NOW + second)
     assert [(alarm.key, alarm.priority) for alarm in own.snapshot(NOW + 3.0).standing] == [
-        ('other', Priority.HIGH), (f'{CONTROL}: extrapolates', Priority.MEDIUM),
-        ('trainer: recording', Priority.LOW)]
+        ('other: is down', Priority.HIGH), (f'{CONTROL}: extrapolates', Priority.MEDIUM),
+        ('trainer: recording: disk is filling', Priority.MEDIUM)]
     # raised at once, in any order
     assert sorted(mark.text for mark in own.trends.marks(0.0, 10.0) if mark.kind == 'alarm') == [
         f'{CONTROL}: extrapolates', 'other: is down', 'trainer: recording: disk is filling']
@@ -444,13 +444,14 @@ def test_statuses_of_other_nodes_crowd_out_none_of_the_own_loop() -> None:
     status(own, 'controller: actuators', WARN, 'stuck', {}, NOW)
     own.advance(NOW + 2.0)
     now = own.snapshot(NOW + 2.0)
-    assert {alarm.key for alarm in now.standing} == {f'{CONTROL}: held', 'controller: actuators'}
+    assert {alarm.key for alarm in now.standing} == {
+        f'{CONTROL}: held', 'controller: actuators: stuck'}
     assert len(now.statuses) < 100
     # nor do those without a fault any that has one
     for second in range(3):
         status(own, 'driver_199: io', ERROR, 'down', {}, NOW + 3.0 + second)
         own.advance(NOW + 3.0 + second)
-    assert 'driver_199: io' in [alarm.key for alarm in own.snapshot(NOW + 6.0).standing]
+    assert 'driver_199: io: down' in [alarm.key for alarm in own.snapshot(NOW + 6.0).standing]
     assert len(own.snapshot(NOW + 6.0).statuses) == len(now.statuses)
 
 
@@ -461,11 +462,12 @@ def test_a_warning_has_one_alarm_whatever_else_is_wrong() -> None:
     status(own, 'controller: actuators', WARN, 'stuck', {}, NOW)
     own.advance(NOW + 2.0)
     assert [(alarm.key, alarm.priority) for alarm in own.snapshot(NOW + 2.0).standing] == [
-        ('controller: actuators', Priority.MEDIUM)]
+        ('controller: actuators: stuck', Priority.MEDIUM)]
     # also seen by the plant
     status(own, 'plant: simulation', WARN, 'stuck', {}, NOW + 2.0)
     own.advance(NOW + 3.4)
-    assert [alarm.key for alarm in own.snapshot(NOW + 3.4).standing] == ['controller: actuators']
+    assert [alarm.key for alarm in own.snapshot(NOW + 3.4).standing] == [
+        'controller: actuators: stuck']
 
 
 WAITING = {'measurements': '0'}
@@ -483,16 +485,18 @@ LATE = {'measurements': '9', 'since last measurement [s]': '40'}
     (CONTROL, ERROR, 'held', LATE, 2.0, {20.0: 'silence of plant: held'}),
     (MEASUREMENTS, WARN, 'late', {}, 2.0, {
         20.0: 'silence of plant: no measurement; '
-              f'{MEASUREMENTS}: {MEASUREMENTS}: late (returned)'}),
+              f'{MEASUREMENTS}: late: {MEASUREMENTS}: late (returned)'}),
     (CONTROL, OK, 'automatic', LATE, 2.0, {20.0: 'silence of plant: no measurement'}),
     # the operator who made a request reads the answer
     (REQUESTS, WARN, 'request rejected: outside', {}, 99.0, {5.0: '', 40.0: ''}),
     (EXPERIMENT, WARN, 'rejected: another node commands', {}, 99.0, {5.0: '', 40.0: ''}),
     # what has ended stands until it is acknowledged, and no longer
     (EXPERIMENT, ERROR, 'aborted: too hot', {}, 99.0, {
-        5.0: f'{EXPERIMENT}: {EXPERIMENT}: aborted: too hot',
-        40.0: f'{EXPERIMENT}: {EXPERIMENT}: aborted: too hot (returned)'}),
-    ('other: io', ERROR, '', {}, 99.0, {5.0: 'other: io: other: io: no reason was given'})])
+        5.0: f'{EXPERIMENT}: aborted: too hot: {EXPERIMENT}: aborted: too hot',
+        40.0: f'{EXPERIMENT}: aborted: too hot: {EXPERIMENT}: aborted: too hot '
+              '(returned)'}),
+    ('other: io', ERROR, '', {}, 99.0, {
+        5.0: 'other: io: no reason was given: other: io: no reason was given'})])
 def test_a_condition_has_one_alarm(
         task: str, level: int, message: str, values: Mapping[str, str], plant: float | None,
         expected: Mapping[float, str]) -> None:
@@ -555,7 +559,7 @@ def test_an_experiment_that_cannot_start_has_a_reason(
     found = experiment_obstacle(own.snapshot(NOW))
     assert words in found
     assert bool(found) is bool(words)
-    assert experiment_running(own.snapshot(NOW)) is (left != '0')
+    assert bool(own.snapshot(NOW).experiment) is (left != '0')
 
 
 def test_each_warning_of_a_status_has_an_alarm_of_its_own() -> None:
@@ -605,7 +609,7 @@ def test_pens_and_marks_are_in_the_time_of_the_plant() -> None:
     assert values.tolist() == pytest.approx([51.0, 52.0, 53.0])
     assert found['temperature set-point'][1].tolist() == pytest.approx([45.0] * 3)
     assert [(mark.time, mark.text) for mark in own.trends.marks(0.0, 10.0)] == [
-        (3.0, 'manual mode')]
+        (3.0, 'manual')]
 
 
 def test_no_line_is_drawn_across_a_silence_of_the_plant() -> None:
@@ -662,7 +666,7 @@ def record(value: float, accepted: bool = True, *codes: str) -> dict[str, Any]:
           'request rejected: it cannot be held'], ['rejected: it cannot be held']),
     ('', [(SETPOINT, record(318.15, False, 'setpoint_not_held')), 2.0],
      ['rejected: setpoint not held']),
-    ('', [TIMEOUT], []), ('', [TIMEOUT + 0.1], ['rejected: the controller did not answer'])])
+    ('', [TIMEOUT], []), ('', [TIMEOUT + 0.1], ['unknown: the controller did not answer'])])
 def test_records_and_statuses_answer_requests(
         words: str, events: list[Any], answers: list[str]) -> None:
     requests = Requests({SETPOINT: ('temperature',), MANUAL: ('coolant_temperature',)},
@@ -681,6 +685,6 @@ def test_records_and_statuses_answer_requests(
 
 def test_an_action_is_a_line_of_json() -> None:
     action = Action('<script>', 'setpoint', 'temperature', 45.0, math.nan)
-    assert json.loads(action_text(action, Answer(False, 'outside'), 12.3456)) == {
+    assert json.loads(AuditEntry.of(action, Answer(False, 'outside'), 12.3456).text()) == {
         'stamp': 12.346, 'who': '<script>', 'what': 'setpoint temperature', 'old': 'nan',
         'new': 45.0, 'accepted': False, 'answer': 'outside'}

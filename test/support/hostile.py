@@ -40,7 +40,7 @@ class HostileSource:
         own.take_record('measurement', {'mode': TEXT, 'level': TEXT}, NOW)
         own.take_record('mode', {'mode': TEXT}, NOW)
         own.take_record('model', {'model': {'name': f'{TEXT}.safetensors', 'digest': TEXT}}, NOW)
-        own.take_record('parameters', {'parameters': list(TEXTS)}, NOW)
+        own.take_record('parameters', {'parameters': dict.fromkeys(TEXTS, 1.0)}, NOW)
         own.take_internals({f'estimated_other [{TEXT}]': 1.0})
         task = {TEXT: TEXT, 'model': TEXT, 'law': TEXT, 'model_file': TEXT, 'accepted': 'True',
                 f'{TEXT} outside training box [half-ranges]': TEXT, 'reason': TEXT,
