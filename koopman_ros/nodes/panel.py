@@ -42,6 +42,7 @@ from koopman_ros.panel.requests import (
 from koopman_ros.panel.snapshot import (
     CONTROL,
     CONTROLLER,
+    PANEL,
     PLANT,
     RECORDING,
     REQUESTS,
@@ -50,7 +51,7 @@ from koopman_ros.panel.snapshot import (
 )
 from koopman_ros.panel.training_report import Learning
 from koopman_ros.panel.view_model import LoopViewModel
-from koopman_ros.parameters.panel import panel_signals, panel_table
+from koopman_ros.parameters.panel import panel_signals, panel_table, PanelParameters
 from koopman_ros.parameters.signal_topics import SignalTopics, words_of
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.ros import remote_node, topics
@@ -90,13 +91,16 @@ class PanelNode(LoopNode):
         super().__init__('panel')
         given = self.given()
         present = load(model_path(str(name))) if (name := given.get('model')) else None
-        self.settings = settings = self.declare_table(panel_table(present, given))
+        table = panel_table(present, given)
+        self.settings = settings = self.declare_table(table)
         self._signals = signals = panel_signals(present, given)
         self._wiring = wiring = SignalTopics.of(signals, settings)
         read = settings.read(signals)
         nodes = {PLANT: PLANT, CONTROLLER: settings.controller, TRAINER: settings.trainer}
         self.view = LoopViewModel(signals, read, settings.span, time.time(), {
             self.resolve_service_name(name).lstrip('/'): role for role, name in nodes.items()})
+        self.view.limits = settings.limits(signals)
+        self.follow_table(table, settings, self._on_parameters)
         self._store = self._open_store(settings.alarm_file)
         self.snapshot = self.view.snapshot(time.time())
         self._words = words_of(signals, {
@@ -115,7 +119,7 @@ class PanelNode(LoopNode):
         self._nodes = {role: RemoteNode(
             self, name, {service: kind for of, service, kind in _SERVICES.values() if of == role},
             None if role == PLANT else partial(self.view.take_parameters, role))
-            for role, name in nodes.items()}
+            for role, name in {**nodes, PANEL: self.get_name()}.items()}
         self._wake = self.create_guard_condition(self._on_actions)
         wall_timer(self, _PERIOD, self._on_timer)
         wall_timer(self, _REMOTE_PERIOD, self._on_remote_timer)
@@ -127,6 +131,9 @@ class PanelNode(LoopNode):
             raise
         self.diagnostics.add('pages', self._status)
         self.get_logger().info(f'the panel is at {self._server.address}')
+
+    def _on_parameters(self, settings: PanelParameters) -> None:
+        self.settings, self.view.limits = settings, settings.limits(self._signals)
 
     def _subscribe(self) -> None:
         matching = self._matching = topics.EndpointMonitor(self, lambda: None)

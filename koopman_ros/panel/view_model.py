@@ -18,10 +18,12 @@ from koopman_ros.core.status import level_words
 from koopman_ros.core.units import conversion, display_unit, printed
 from koopman_ros.panel.conditions import Conditions
 from koopman_ros.panel.faceplates import pen, Range, readable, SignalValues
+from koopman_ros.panel.process_alarms import ProcessAlarms
 from koopman_ros.panel.requests import AuditEntry
 from koopman_ros.panel.snapshot import CONTROL, CONTROLLER, OK, PLANT, ROLES, Snapshot, TaskStatus
 from koopman_ros.panel.trends import Trends
 from koopman_ros.parameters.description import ParameterDescription
+from koopman_ros.parameters.panel import ProcessLimits
 from koopman_ros.parameters.signal_topics import Signals
 
 _BACK = 1.0  # s; a stamp that is earlier by more restarts the time
@@ -69,6 +71,8 @@ class LoopViewModel:
         self._about: Mapping[str, str] = MappingProxyType({})
         self._previous_model = ''
         self._model: dict[str, Any] = {}
+        self._process = ProcessAlarms(self.alarms)
+        self.limits: Mapping[str, ProcessLimits] = {}  #: of the alarms of measurements, by name
         self._audit: deque[AuditEntry] = deque(maxlen=MAX_AUDIT)
 
     @property
@@ -94,6 +98,12 @@ class LoopViewModel:
             if math.isfinite(read) and kind != 'active_setpoints':
                 self._draw(pen(kind, name), stamp, read)
         if kind == 'measured' and not math.isnan(self._time):
+            for name, limits in self.limits.items():
+                own = self._all[name]
+                self._process.take(
+                    readable(name), printed(own.read), own.get('measured'),
+                    own.get('active_setpoints') if self._mode == 'automatic' else math.nan,
+                    limits, now)
             for name in self.signals.controlled:
                 setpoint = self._states[name].get('active_setpoints')
                 if math.isfinite(setpoint):

@@ -6,9 +6,18 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from ipaddress import ip_network
+import math
 from types import MappingProxyType
 from typing import Any
 
+from koopman_ros.core.arrays import Array
+from koopman_ros.core.declaration import (
+    column,
+    NO_LOWER,
+    NO_UPPER,
+    UNBOUNDED,
+    value_column,
+)
 from koopman_ros.core.units import conversion, display_unit
 from koopman_ros.model import LiftedModel
 from koopman_ros.parameters.signal_topics import (
@@ -51,6 +60,17 @@ class ShownDisturbance(MeasuredPlace):
     shown_unit: str = _shown_unit()
 
 
+@dataclass(frozen=True)
+class ProcessLimits:
+    """Limits of a measurement, in the unit in which people read it; an infinity is no limit."""
+
+    high: float = math.inf
+    low: float = -math.inf
+    deviation: float = math.inf  #: from the set-point, in automatic mode
+    deadband: float = 0.0  #: by which a value must be back within its limit
+    delay: float = 0.0  #: s of wall time beyond a limit until the alarm
+
+
 @dataclass(frozen=True, eq=False)
 class PanelParameters(SignalParameters):
     """Parameters of the panel."""
@@ -89,9 +109,32 @@ class PanelParameters(SignalParameters):
              'later press is refused.', 's', 1.0, 60.0, read_only=True)
     span: float = parameter(
         28800.0, 'Length of the trends.', 's', 600.0, 604800.0, read_only=True)
+    alarm_high: Array = value_column(
+        'states', UNBOUNDED, 'Measurement above which an alarm is raised.', none=NO_UPPER)
+    alarm_low: Array = value_column(
+        'states', -UNBOUNDED, 'Measurement below which an alarm is raised.', none=NO_LOWER)
+    alarm_deviation: Array = column(
+        'states', UNBOUNDED, 'Distance from the set-point beyond which an alarm is raised in '
+                             'automatic mode.', none=NO_UPPER)
+    alarm_deadband: Array = column(
+        'states', 0.0, 'Distance by which the measurement must be back before its alarm returns.')
+    alarm_delay: Array = column(
+        'states', 10.0, 'Wall time beyond a limit until the alarm.', 's', 0.0, 3600.0)
     states: Mapping[str, ShownState] = per_signal(ShownState)
     inputs: Mapping[str, ShownInput] = per_signal(ShownInput)
     disturbances: Mapping[str, ShownDisturbance] = per_signal(ShownDisturbance)
+
+    def limits(self, signals: Signals) -> dict[str, ProcessLimits]:
+        """Return the limits of alarms of measured states, as people read them, by name."""
+        found = {}
+        for at, name in enumerate(signals.states):
+            shown = conversion(signals.states[name], self.read(signals)[name])
+            low, high, per_unit = (float(shown(value)) for value in (
+                self.alarm_low[at], self.alarm_high[at], 1.0))
+            per_unit -= float(shown(0.0))
+            found[name] = ProcessLimits(high, low, per_unit * self.alarm_deviation[at],
+                                        per_unit * self.alarm_deadband[at], self.alarm_delay[at])
+        return found
 
     def read(self, signals: Signals) -> dict[str, str]:
         """Return the units in which people read the signals, by name."""

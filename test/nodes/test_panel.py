@@ -78,6 +78,10 @@ def test_pages_are_served_to_this_machine_alone_and_a_port_only_once(
         assert not re.findall(r'(?:src|href)="?(?:https?:)?//', text)
         assert headers['x-frame-options'] == 'DENY'
     assert get(url, Origin=url)[0] == 200
+    # two panels of two loops do not look the same
+    other = address(ros, ros.start('panel', {'port': 0}, ('-r', '__ns:=/line_2')))
+    assert '<title>Overview – line_2 reactor</title>' in get(other)[1]
+    assert '<title>Overview – reactor</title>' in get(url)[1]
     for headers in ({'Origin': 'http://elsewhere'}, {'Host': 'elsewhere.example'}):
         status, text, _ = get(url, **headers)
         assert status == 403
@@ -298,8 +302,11 @@ def asks_for_all_that_there_is(desk: Panel, controller: NodeProcess) -> None:
     # services of the trainer
     assert desk.ask('record', TRAINER, False).accepted
     assert desk.ask('cancel', TRAINER) == Answer(False, 'not training')
-    desk.wait(lambda: {'set-point', 'mode', 'parameter'} <= {
-        mark.kind for mark in node.view.trends.marks(0.0, 1e12)})
+    # each with its person, before the value and after
+    desk.wait(lambda: {
+        ('set-point', 'temperature 45 → 46 °C by anna'), ('mode', 'automatic → manual by anna'),
+        ('parameter', 'coolant_temperature.max: 32 → 30.0 by anna')} <= {
+        (mark.kind, mark.text) for mark in node.view.trends.marks(0.0, 1e12)})
     assert controller.stop() == 0
     desk.wait(lambda: not node.count_publishers(topics.EVENT_LOG))
     assert desk.ask('setpoint', reactor.TEMPERATURE, 45.0) == Answer(

@@ -5,12 +5,19 @@
 
 from collections.abc import Iterator
 import contextlib
+import csv
+from pathlib import Path
 import re
+import time
 from typing import Any
 
 from playwright.sync_api import BrowserContext, expect, Locator, Page, WebSocketRoute
 import pytest
 
+from koopman_ros.core.paths import model_path
+from koopman_ros.panel.requests import Action
+from koopman_ros.panel.snapshot import CONTROLLER, ERROR, OK, PLANT, WARN
+from koopman_ros.parameters.panel import ProcessLimits
 from support.browser import Pages, PATIENCE
 from support.operated import OperatedLoop
 from support.users import PASSWORDS
@@ -155,5 +162,227 @@ def test_an_answer_ends_when_another_set_point_holds(desk: Desk) -> None:
         expect(answer).to_have_text('accepted')
         page.wait_for_timeout(2500.0)
         expect(answer).to_have_text('accepted')
-        loop.request(type(loop.asked[0])('otto', 'setpoint', 'temperature', 47.0))
+        loop.request(Action('otto', 'setpoint', 'temperature', 47.0))
         expect(answer).to_have_text('')
+
+
+def texts(where: Locator) -> list[str]:
+    return where.get_by_role('listitem').all_inner_texts()
+
+
+def test_each_event_has_its_own_time_values_and_person(desk: Desk) -> None:
+    with desk.page('/trends') as (loop, page):
+        events = page.get_by_role('list', name='Events')
+        for who, value in (('otto', 46.0), ('olga', 46.5)):
+            loop.request(Action(who, 'setpoint', 'temperature', value))
+        expect(events).to_contain_text('set-point: temperature 45 → 46 °C by otto')
+        expect(events).to_contain_text('set-point: temperature 46 → 46.5 °C by olga')
+        page.goto(f'{desk.url}/audit')
+        actions = page.get_by_role('list', name='Actions')
+        expect(actions).to_contain_text('otto: setpoint temperature 46')
+        with page.expect_download() as download:
+            page.get_by_role('button', name='Export CSV').click()
+        rows = list(csv.DictReader(Path(download.value.path()).read_text().splitlines()))
+        assert [(row['who'], row['new'], row['accepted']) for row in rows] == [
+            ('otto', '46', 'True'), ('olga', '46.5', 'True')]
+        page.get_by_label('Filter').fill('olga')
+        expect(actions.get_by_role('listitem')).to_have_count(1)
+
+
+def alarm(page: Page, said: str) -> Locator:
+    return page.get_by_role('list', name='Active alarms').get_by_role('listitem').filter(
+        has_text=said)
+
+
+def test_another_fault_of_one_status_is_another_alarm(desk: Desk) -> None:
+    with desk.page('/alarms') as (loop, page):
+        loop.status('pump: bearing', WARN, 'bearing at 81 degC')
+        warm = alarm(page, 'bearing at')
+        warm.get_by_role('button', name='Acknowledge').click()
+        expect(warm).to_contain_text('acknowledged by anna')
+        loop.status('pump: bearing', WARN, 'bearing at 82 degC')
+        expect(alarm(page, '82 °C')).to_contain_text('acknowledged by anna')
+        loop.status('pump: bearing', WARN, 'oil low')
+        expect(alarm(page, 'oil low')).to_contain_text(', unacknowledged')
+        expect(page.get_by_label('Last 24 hours')).to_contain_text(
+            'raised: pump: bearing: oil low')
+
+
+def test_the_most_urgent_alarm_is_on_every_page_and_in_the_title(desk: Desk) -> None:
+    with desk.page('/tuning') as (loop, page):
+        counts = page.locator('.counts')
+        expect(counts).to_have_text('No alarms')
+        top = page.locator('.tabs').bounding_box()
+        loop.status('pump: bearing', WARN, 'bearing warm')
+        loop.status('pump: motor', ERROR, 'motor tripped')
+        strip = page.get_by_role('list', name='Most urgent alarm')
+        expect(strip).to_contain_text('motor tripped')
+        expect(strip).to_contain_text('HIGH')
+        expect(counts).to_have_text('2 unacknowledged · 2 active')
+        expect(page).to_have_title(re.compile(r'^■ HIGH \(2\) Tuning'))
+        # nothing below has moved
+        assert page.locator('.tabs').bounding_box() == top
+        sound = page.get_by_role('button', name='Sound')
+        expect(sound).to_have_attribute('aria-pressed', 'false')
+        sound.click()
+        expect(sound).to_have_attribute('aria-pressed', 'true')
+        sound.click()
+        strip.get_by_role('button', name='Acknowledge: pump: motor: motor tripped').click()
+        expect(strip).to_contain_text('bearing warm')
+        for key in ('pump: bearing: bearing warm', 'pump: motor: motor tripped'):
+            assert loop.view.alarms.shelve(key, 600.0, 'otto', time.time())
+        expect(counts).to_have_text('2 shelved')
+
+
+def test_a_click_does_nothing_on_a_row_that_has_just_moved(desk: Desk) -> None:
+    with desk.page('/alarms') as (loop, page):
+        loop.status('pump: bearing', WARN, 'bearing warm')
+        low = alarm(page, 'bearing warm')
+        button = low.get_by_role('button', name='Acknowledge')
+        expect(button).to_be_enabled()
+        page.wait_for_timeout(800.0)
+        box = button.bounding_box()
+        assert box is not None
+        loop.status('pump: motor', ERROR, 'motor tripped')
+        # the click comes as the row of the other alarm takes the place
+        page.evaluate("""([x, y]) => new Promise(done => {
+            const list = document.querySelector('[aria-label="Active alarms"]');
+            new MutationObserver((_, own) => {
+                if (!list.innerText.includes('motor')) return;
+                own.disconnect();
+                setTimeout(() => { document.elementFromPoint(x, y)?.click(); done(); }, 50);
+            }).observe(list, {subtree: true, childList: true, characterData: true});
+        })""", [box['x'] + 10.0, box['y'] + 10.0])
+        page.wait_for_timeout(700.0)
+        expect(alarm(page, 'motor tripped')).to_contain_text(', unacknowledged')
+        expect(low).to_contain_text(', unacknowledged')
+        alarm(page, 'motor').get_by_role('button', name='Acknowledge').click()
+        expect(alarm(page, 'motor')).to_contain_text('acknowledged by anna')
+
+
+def test_models_are_compared_on_the_same_data_with_what_their_ranges_gain_and_lose(
+        desk: Desk) -> None:
+    loop = OperatedLoop()
+    new = str(model_path('reactor_nz4'))
+    figures = {'accepted': 'True', 'model_file': new, 'units: temperature': 'K',
+               'heldout_error: temperature': '0.41'}
+    loop.status('trainer: training', OK, 'done', {
+        **figures, 'heldout_error_of_current_model: temperature': '1.7'})
+    with desk.page('/model', loop) as (_, page):
+        activate = page.get_by_role('button', name='Activate the new model …')
+        activate.click()
+        dialog = page.get_by_role('dialog')
+        expect(dialog).to_contain_text('Error on the new record, temperature [K]')
+        expect(dialog.locator('.changes')).to_contain_text(re.compile(r'1\.7\s*0\.41'))
+        expect(dialog).to_contain_text('lost by the new model')
+        assert 'Held-out' not in dialog.inner_text()
+        page.keyboard.press('Escape')
+        # the training compared with a model that is no longer the active one
+        loop.control['model'] = 'another'
+        expect(page.get_by_label('Model', exact=True)).to_contain_text('another')
+        activate.click()
+        expect(dialog).to_contain_text('Error on the same data')
+        expect(dialog).to_contain_text('not known')
+        assert '1.7' not in dialog.inner_text()
+        page.keyboard.press('Escape')
+
+
+def test_an_experiment_is_on_every_page_and_a_set_point_asks_before_it_ends_it(
+        desk: Desk) -> None:
+    with desk.page('/model') as (loop, page):
+        experiment = page.get_by_label('Experiment', exact=True)
+        page.get_by_role('button', name='Start …').click()
+        dialog = page.get_by_role('dialog')
+        expect(dialog).to_contain_text('temperature: set-points 40 °C to 50 °C')
+        # the bounds of steps of the coolant do not hold for steps of set-points
+        expect(dialog).to_contain_text('coolant: moved by the controller within its limits, '
+                                       '5.0 to 32.0 °C')
+        assert '10 °C' not in dialog.inner_text()
+        page.keyboard.press('Escape')
+        loop.status('trainer: experiment', OK, 'running', {'left [s]': '812'})
+        expect(experiment.get_by_role('button', name='End')).to_be_enabled()
+        for path in ('/trends', '/'):
+            page.goto(f'{desk.url}{path}')
+            expect(page.locator('header')).to_contain_text('EXPERIMENT, 812 s left')
+        ready(page)
+        asked(page).fill('46')
+        asked(page).press('Enter')
+        expect(dialog).to_contain_text('Abort the experiment?')
+        page.get_by_role('button', name='Cancel').click()
+        expect(face(page, 'temperature').locator('.answer')).to_contain_text('not sent')
+        assert not loop.asked
+        asked(page).fill('46')
+        asked(page).press('Enter')
+        page.get_by_role('button', name='Abort the experiment').click()
+        expect(face(page, 'temperature').locator('.answer')).to_have_text('accepted')
+
+
+def test_limits_are_for_engineers_and_are_confirmed(
+        desk: Desk, browser: Pages, served: Any) -> None:
+    with desk.page('/tuning') as (loop, page):
+        def row() -> Locator:
+            page.get_by_label('Parameters of the controller').get_by_text(
+                'coolant', exact=True).click()
+            return page.locator('[data-parameter="coolant.max"]')
+
+        own = row()
+        own.get_by_role('textbox').fill('1000')
+        own.get_by_role('textbox').press('Enter')
+        dialog = page.get_by_role('dialog')
+        expect(dialog.locator('.changes')).to_contain_text(re.compile(r'32 °C\s*1000 °C'))
+        page.keyboard.press('Escape')
+        expect(own.locator('.answer')).to_have_text('not changed')
+        assert not loop.asked
+        own.get_by_role('textbox').press('Enter')
+        dialog.get_by_role('button', name='Change').click()
+        expect(own.locator('.answer')).to_have_text('accepted')
+        assert [action.value for action in loop.asked] == [{'coolant.max': 1000.0}]
+    operator = Desk(browser, served, 'olga')
+    with contextlib.closing(operator.context), operator.page('/tuning') as (loop, page):
+        page.get_by_label('Parameters of the controller').get_by_text(
+            'coolant', exact=True).click()
+        own = page.locator('[data-parameter="coolant.max"]')
+        expect(own.get_by_role('textbox')).to_be_disabled()
+        expect(own.get_by_role('button')).to_have_attribute('title', re.compile('engineer'))
+        page.goto(operator.url)
+        ready(page)
+        asked(page).fill('46')
+        asked(page).press('Enter')
+        expect(face(page, 'temperature').locator('.answer')).to_have_text('accepted')
+
+
+def test_bad_quality_is_shown_at_each_value(desk: Desk) -> None:
+    with desk.page() as (loop, page):
+        ready(page)
+        temperature, coolant = face(page, 'temperature'), face(page, 'coolant')
+        abnormal = temperature.locator('.abnormal')
+        loop.control['rejected measurements'] = 'temperature'
+        expect(abnormal).to_have_text('▲ measurement rejected')
+        del loop.control['rejected measurements']
+        expect(abnormal).to_be_hidden()
+        loop.applied = 27.0
+        expect(coolant.locator('.abnormal')).to_have_text('▲ applied differs from the command')
+        loop.applied = 20.0
+        loop.level = 'hold'
+        expect(coolant.locator('.abnormal')).to_contain_text('held')
+        loop.level = 'sdre'
+        expect(coolant.locator('.abnormal')).to_be_hidden()
+        for role, shown in ((PLANT, coolant.locator('.value')),
+                            (CONTROLLER, temperature.locator('.value'))):
+            loop.silent.add(role)
+            expect(shown).to_have_class(re.compile(r'\bold\b'))
+            expect(shown).to_have_text(re.compile(r'^\? '))
+            expect(temperature.get_by_role('button', name='Set')).to_be_disabled()
+            expect(asked(page)).to_be_disabled()
+            loop.silent.remove(role)
+            expect(shown).not_to_have_class(re.compile(r'\bold\b'))
+            expect(asked(page)).to_be_enabled()
+
+
+def test_a_measurement_beyond_its_limit_is_an_alarm(desk: Desk) -> None:
+    loop = OperatedLoop()
+    loop.measured = 51.0
+    loop.view.limits = {'temperature': ProcessLimits(high=50.0, deviation=1.5)}
+    with desk.page('/alarms', loop) as (_, page):
+        expect(alarm(page, 'above its high limit 50 °C')).to_contain_text('HIGH')
+        expect(alarm(page, 'from the set-point')).to_contain_text('MEDIUM')

@@ -42,6 +42,7 @@ from koopman_ros.panel.snapshot import (
 from koopman_ros.panel.trend_chart import _charts
 from koopman_ros.panel.view_model import LoopViewModel
 from koopman_ros.parameters.description import ParameterDescription
+from koopman_ros.parameters.panel import ProcessLimits
 from koopman_ros.parameters.signal_topics import Signals
 
 REACTOR = Signals({'temperature': 'K'}, {'coolant_temperature': 'K'}, ('temperature',))
@@ -591,6 +592,41 @@ def test_each_warning_of_a_status_has_an_alarm_of_its_own() -> None:
     assert sorted(alarm.text for alarm in own.snapshot(NOW + 26.0).standing
                   if alarm.text.startswith(CONTROL)) == [
         f'{CONTROL}: held: late', f'{CONTROL}: held: stuck for 6 s']
+
+
+def test_an_alarm_of_a_measurement_has_a_delay_and_a_deadband() -> None:
+    own = view()
+    own.limits = {'temperature': ProcessLimits(
+        high=50.0, low=40.0, deviation=3.0, deadband=0.5, delay=10.0)}
+    own.take_signals('active_setpoints', {'temperature': to_kelvin(45.0)}, 0.0, NOW)
+
+    def standing(celsius: float, second: float) -> dict[str, AlarmState]:
+        answered(own, wall=NOW + second)
+        measure(own, celsius, second, NOW + second)
+        own.advance(NOW + second)
+        return {alarm.key.rpartition(': ')[2]: alarm.state for alarm in own.alarms.standing
+                if alarm.key.startswith('process')}
+
+    up, back = AlarmState.UNACKNOWLEDGED, AlarmState.RETURNED
+    assert standing(50.2, 1.0) == {}
+    assert standing(50.2, 10.0) == {}
+    assert standing(50.2, 11.5) == {'high': up, 'deviation': up}
+    # back by less than the deadband
+    standing(49.6, 12.0)
+    assert standing(49.6, 20.0) == {'high': up, 'deviation': up}
+    standing(47.4, 21.0)
+    assert standing(47.4, 27.0) == {'high': back, 'deviation': back}
+    standing(39.0, 28.0)
+    assert standing(39.0, 39.0)['low'] is up
+    # the set-point is not controlled in manual mode
+    other = view()
+    other.limits, own = own.limits, other
+    own.take_signals('active_setpoints', {'temperature': to_kelvin(45.0)}, 0.0, NOW)
+    answered(own, mode='manual')
+    for second in range(1, 20):
+        measure(own, 49.0, float(second), NOW + second)
+        own.advance(NOW + second)
+    assert not [alarm for alarm in own.alarms.standing if 'deviation' in alarm.key]
 
 
 # Trends.

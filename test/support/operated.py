@@ -38,6 +38,7 @@ class OperatedLoop:
         self.silent: set[str] = set()
         self.asked: list[Action] = []
         self.measured, self.applied, self.command = 47.0, 20.0, 20.0
+        self.level = 'sdre'
         self.control: dict[str, str] = {'mode': 'automatic', 'model': 'old'}
         self._statuses: dict[str, tuple[int, str, Mapping[str, str]]] = {}
         signals = Signals({'temperature': 'degC'}, {'coolant': 'degC'}, ('temperature',))
@@ -88,7 +89,8 @@ class OperatedLoop:
                 view.take_signals('commands', {'coolant': self.command}, now, now)
                 view.take_signals('predicted', {'temperature': self.measured}, now, now)
                 view.take_signals('active_setpoints', {'temperature': self._setpoint}, now, now)
-                self._record('measurement', mode='automatic', level='sdre')
+                self._record('silence' if PLANT in self.silent else 'measurement',
+                             mode='automatic', level=self.level)
                 view.conditions.take_status('controller: control', OK, 'automatic', self.control,
                                             now, 'reactor')
             if TRAINER not in self.silent:
