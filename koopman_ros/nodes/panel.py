@@ -28,6 +28,7 @@ from koopman_ros.model import load
 from koopman_ros.panel.alarm_store import AlarmStore
 from koopman_ros.panel.faceplates import Range
 from koopman_ros.panel.files import sanitize_text
+from koopman_ros.panel.history import HistoryFile
 from koopman_ros.panel.learning_watch import LearningWatch
 from koopman_ros.panel.model_card import model_card, training_ranges
 from koopman_ros.panel.requests import (
@@ -102,6 +103,7 @@ class PanelNode(LoopNode):
         self.view.limits = settings.limits(signals)
         self.follow_table(table, settings, self._on_parameters)
         self._store = self._open_store(settings.alarm_file)
+        self._history = self._open_history(settings.history_file)
         self.snapshot = self.view.snapshot(time.time())
         self._words = words_of(signals, {
             name: Display(unit, read[name], '.6g') for name, unit in signals.units.items()
@@ -166,6 +168,16 @@ class PanelNode(LoopNode):
             self.get_logger().warning(store.complaint)
         return store
 
+    def _open_history(self, path: str) -> HistoryFile | None:
+        if not path:
+            return None
+        try:
+            return HistoryFile(self.view, Path(path), time.time())
+        except (OSError, ValueError) as error:
+            raise ConfigurationError(
+                f'history_file = {path!r} cannot be used ({error}): name a new file in a writable '
+                'folder, or a file written by a panel') from error
+
     def _serve(self) -> Any:
         try:
             from koopman_ros.panel.server import PanelServer
@@ -184,8 +196,8 @@ class PanelNode(LoopNode):
         """Stop the pages, and save the alarms."""
         self._watch.complete()
         self._server.stop()
-        if self._store is not None:
-            self._store.close()
+        for file in filter(None, (self._store, self._history)):
+            file.close()
 
     # For the pages; called from their thread.
 
@@ -272,13 +284,12 @@ class PanelNode(LoopNode):
     def _on_timer(self) -> None:
         now = time.time()
         self.view.advance(now)
-        if self._store is not None:
+        for file in filter(None, (self._store, self._history)):
             try:
-                self._store.save(now)
+                file.save(now)
             except OSError as error:
-                self.get_logger().error(
-                    f'alarms are not written to {self.settings.alarm_file}: {error}',
-                    throttle_duration_sec=60.0)
+                self.get_logger().error(f'{type(file).__name__} is not written: {error}',
+                                        throttle_duration_sec=60.0)
         self.diagnostics.hardware_id = self.view.conditions.plant or self.settings.system
         self._requests.advance(time.monotonic())
         self._watch.advance()

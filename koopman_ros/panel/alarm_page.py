@@ -60,7 +60,7 @@ class _Choice:
     """Which of the alarms are shown, and in which order."""
 
     def __init__(self) -> None:
-        with box('row1 middle'):
+        with box('row1 middle view'):
             self._text = ui.input('Filter').props('outlined dense clearable')
             self._priority = self._select('Priority', [_ALL, *(
                 one.word for one in reversed(Priority))])
@@ -206,9 +206,10 @@ def _row(page: PageLayout, first: Alarm, shelving: Iterable[str], chosen: set[st
         priority.classes(replace=word)
         what.set_text(alarm.text)
         by = f' by {alarm.acknowledged_by}' if alarm.acknowledged_by else ''
-        stale = 'stale: its node no longer reports it' * (alarm.key in now.stale)
+        stale = 'stale: its node is silent' * (alarm.key in now.stale)
         state.set_text(', '.join(filter(None, (
-            clock(alarm.since), f'{alarm.state.value}{by}', note, stale))))
+            clock(alarm.since), '' if chosen is None else f'{alarm.state.value}{by}', note,
+            stale))))
         acknowledged = alarm.state is AlarmState.ACKNOWLEDGED
         # the row keeps its shape
         button.style(replace='visibility: hidden' if acknowledged else '')

@@ -25,7 +25,7 @@ def audit_page(page: PageLayout) -> None:
     """Build the page."""
     with page.body:
         label('h2', 'Actions')
-        with box('row1 middle'):
+        with box('row1 middle view'):
             ui.button('Export CSV', on_click=lambda: ui.download.content(
                 exported(page.source.view.audit), 'audit.csv')).props('outline')
             wanted = ui.input('Filter').props('outlined dense clearable')

@@ -97,7 +97,7 @@ class Conditions:
         """Take note of a message of a node; of the plant it is a measurement."""
         self._follow_clock(now)
         last = self._last.get(role)
-        if last is None or now - last > self._patience(role):
+        if last is None or now - last > self.patience(role):
             self._begun[role] = now
         if role == PLANT and last is not None and now > last:
             self._period = min(0.9 * (self._period or now - last) + 0.1 * (now - last), 600.0)
@@ -200,7 +200,7 @@ class Conditions:
         status = self.statuses.get(CONTROL, TaskStatus(CONTROL, OK, ''))
         try:
             return status.level > OK and (status.values.get('measurements') == '0' or float(
-                status.values['since last measurement [s]']) > self._patience(PLANT))
+                status.values['since last measurement [s]']) > self.patience(PLANT))
         except (KeyError, ValueError):
             return False
 
@@ -251,7 +251,8 @@ class Conditions:
 
     def is_silent(self, role: str, now: float) -> bool:
         """Return whether a node has sent no message for too long."""
-        return now - self._last.get(role, self._start) > self._patience(role)
+        return now - self._last.get(role, self._start) > self.patience(role)
 
-    def _patience(self, role: str) -> float:
+    def patience(self, role: str) -> float:
+        """Return the s after which a node without a message is silent."""
         return max(_SILENT, _PERIODS * self._period) if role == PLANT else _SILENT

@@ -35,8 +35,8 @@ def number(value: float, decimals: int) -> str:
 
 
 def exact(value: float, decimals: int) -> str:
-    """Write a value that was asked for, with all digits that were written, of at most eight."""
-    more = next((more for more in range(decimals, 9)
+    """Write a value with the digits that a person wrote, of which there are few."""
+    more = next((more for more in range(decimals, decimals + 4)
                  if math.isclose(round(value, more), value, rel_tol=1e-9, abs_tol=1e-12)),
                 decimals)
     return number(value, more)
@@ -118,6 +118,7 @@ class InputFaceplate(Faceplate):
     manual: float  #: requested in manual mode, within the limits, or the command
     disturbance: float  #: as a change of the input, in the signal's own unit
     own_unit: str  #: of the disturbance
+    dead_time: float  #: s until it acts
 
 
 @dataclass
@@ -163,12 +164,14 @@ class SignalValues:
             self.active, self.plan, _old(silent), controlled, measured, setpoint,
             self.get('target', setpoint), self.get('predicted'), disturbance)
 
-    def input(self, limits: Range | None, silent: Container[str], level: str) -> InputFaceplate:
+    def input(self, limits: Range | None, silent: Container[str], level: str, dead_time: float
+              ) -> InputFaceplate:
         """
         Return the faceplate of an input with its limits.
 
         :param silent: roles of nodes.
         :param level: name of the control level.
+        :param dead_time: s until it acts, NaN if unknown.
         """
         command, applied = self.get('commands'), self.get('applied')
         span = _span([limits, self.training], [command, applied])
@@ -187,7 +190,7 @@ class SignalValues:
         return InputFaceplate(
             self.name, printed(self.read), span, _decimals(span), self.training, abnormal, limits,
             self.active, self.plan, _old(silent), command, applied, self.get('manual', command),
-            self.get('disturbance'), self.unit)
+            self.get('disturbance'), self.unit, dead_time)
 
 
 def _old(silent: Container[str]) -> frozenset[str]:

@@ -127,7 +127,7 @@ class _Entry:
         for control in (self._field, self._button, self._slider):
             self._page.allow(control, not obstacle, obstacle)
         text = face.exact(present) if math.isfinite(present) else ''
-        if text and self._field.value in (self._shown, ''):
+        if text and self._field.value == self._shown:
             self._set(text)
         self._shown = text
         attribute(self._box, 'data-present', text)
@@ -254,7 +254,8 @@ def _input_card(page: PageLayout, at: int, face: InputFaceplate) -> None:
         change = own.disturbance
         disturbance = f' · disturbance {change:+z.{own.decimals + 1}f} {own.own_unit}' if (
             math.isfinite(change)) else ''
-        details.set_text(limits + disturbance)
+        late = f' · dead time {own.dead_time:.3g} s' if own.dead_time > 0.0 else ''
+        details.set_text(limits + disturbance + late)
         show_if(manual, now.mode == 'manual')
         entry.show(own, own.manual, now.obstacle)
 

@@ -34,8 +34,12 @@ _HEAD, _FOOT = 56, 44  # pixels above and below the plot of a chart
 # Pixels for the names of pens in charts from these widths on, as in style.css.
 _WIDTHS = {0: 320, 600: 560, 900: 860}
 _ROW = 20  # pixels of each further row of names
-_LINES = {'measured': ('solid', 2.0), 'active_setpoints': ('dashed', 1.6),
-          'predicted': ('dotted', 1.2), 'planned': ('dotted', 1.6), 'commands': ('solid', 2.0)}
+# width of a line by its kind, and dashes: of the measurements and commands of several signals of
+# a chart each has its own, so that they differ without colour
+_LINES: dict[str, tuple[float, list[int]]] = {
+    'active_setpoints': (1.3, [8, 4]), 'predicted': (1.0, [1, 3]), 'planned': (1.4, [2, 2]),
+    'applied': (1.3, [5, 3])}
+_DASHES: Sequence[list[int]] = ([], [14, 3], [3, 2], [12, 3, 3, 3], [7, 3, 2, 3, 2, 3])
 _ABNORMAL = '#8a4b00'
 # clock of trend_page in the browser
 _CLOCK = ('t => t >= 1e12 ? new Date(t).toISOString().slice(11, 19) : '
@@ -96,6 +100,17 @@ class TrendChart:
         if zoom:
             self._chart.on('chart:datazoom', self._on_zoom, ['start', 'end', 'batch'],
                            throttle=_PAUSE, leading_events=False)
+
+    @property
+    def live(self) -> bool:
+        """Whether the present is shown."""
+        return self._end is None and self._zoomed[1] >= 1.0 - 1e-3
+
+    def reset(self) -> None:
+        """Show the whole time again."""
+        self._zoomed, self._due = _ALL, 0.0
+        self._chart.run_chart_method('dispatchAction', {
+            'type': 'dataZoom', 'start': 0, 'end': 100})
 
     def show(self, span: str, whole: bool, end: float | None) -> None:
         """
@@ -235,7 +250,7 @@ def ink(number: int) -> str:
 def legend_rows(names: Sequence[str], width: int) -> int:
     """Return the number of rows that names of pens take in a width in pixels."""
     rows, room = 1, width
-    for needed in (7 * len(name) + 29 for name in names):
+    for needed in (7 * len(name) + 49 for name in names):
         if needed > room:
             rows, room = rows + 1, width
         room -= needed
@@ -261,6 +276,7 @@ def _options(charts: _Charts, height: int, zoom: bool) -> dict[str, Any]:
     several = range(len(charts))
     pens = [(at, number, own) for at, (_, own_pens) in enumerate(charts)
             for number, own in enumerate(own_pens)]
+    order = [list(dict.fromkeys(own.signal for own in own_pens)) for _, own_pens in charts]
     marked = {'symbol': 'none', 'symbolSize': 8, 'animation': False,
               'lineStyle': {'type': 'dashed', 'color': '#8a8a86'},
               'label': {'formatter': '{b}', 'position': 'insideEndTop', 'fontSize': 10,
@@ -288,8 +304,8 @@ def _options(charts: _Charts, height: int, zoom: bool) -> dict[str, Any]:
                     'data': [own.title for own in own_pens if own.kind != 'planned'],
                     # the unit is at the axis
                     ':formatter': "name => name.split(' [')[0]",
-                    'textStyle': {'color': '#1d1d1b', 'fontSize': 13}, 'icon': 'roundRect',
-                    'itemHeight': 14, 'itemWidth': 14}
+                    'textStyle': {'color': '#1d1d1b', 'fontSize': 13},
+                    'itemHeight': 12, 'itemWidth': 34}
                    for _, own_pens in charts],
         # all charts have the same width, also below a long name
         'grid': [{'left': 56, 'right': 16, 'height': height - _HEAD - _FOOT,
@@ -313,6 +329,11 @@ def _options(charts: _Charts, height: int, zoom: bool) -> dict[str, Any]:
                     'xAxisIndex': at, 'yAxisIndex': at, 'data': [],
                     'step': 'end' if own.steps else False,
                     'color': ink(number), 'markLine': marked,
-                    'lineStyle': dict(zip(('type', 'width'), _LINES.get(
-                        own.kind, ('dashed', 1.2)), strict=True))}
+                    'lineStyle': line(own.kind, order[at].index(own.signal))}
                    for at, number, own in pens]}
+
+
+def line(kind: str, place: int) -> dict[str, Any]:
+    """Return the style of a line of a kind; `place` is that of its signal in the chart."""
+    width, dashes = _LINES.get(kind, (2.2, _DASHES[place % len(_DASHES)]))
+    return {'width': width, 'type': dashes or 'solid'}

@@ -10,7 +10,7 @@ from typing import Any
 
 from nicegui import ui
 
-from koopman_ros.panel.layout import box, label, PageLayout
+from koopman_ros.panel.layout import box, label, PageLayout, show_if
 from koopman_ros.panel.snapshot import Snapshot
 from koopman_ros.panel.trend_chart import EPOCH, SPANS, TrendChart
 
@@ -28,10 +28,11 @@ def trend_page(page: PageLayout) -> None:
             until = ui.input('Until, h:mm:ss', placeholder='now', validation={
                 'not h:mm:ss or h:mm': lambda text: not text or time_of_day(
                     str(text), page.source.view.trends.latest or 0.0) is not None}).props(
-                        'outlined dense')
+                        'outlined dense hide-bottom-space')
             earlier = ui.button('Earlier').props('outline')
             later = ui.button('Later').props('outline')
-            ui.button('Now', on_click=lambda: until.set_value('')).props('outline')
+            present = ui.button('Now').props('outline')
+            past = label('span', '▲ NOT LIVE', 'abnormal hidden')
             label('span', 'Click a name to hide its line; scroll or pinch to zoom, drag to pan, '
                   'hover to read values and events', 'quiet')
         chart = TrendChart(page, 290, zoom=True)
@@ -41,6 +42,7 @@ def trend_page(page: PageLayout) -> None:
 
     def show(_: Snapshot) -> None:
         chart.update()
+        show_if(past, not chart.live)
         if shown[0] == chart.marks:
             return
         shown[0] = chart.marks
@@ -70,6 +72,7 @@ def trend_page(page: PageLayout) -> None:
 
     for control in (span, whole, until):
         control.on_value_change(change)
+    present.on_click(lambda: (until.set_value(''), chart.reset()))
     earlier.on_click(lambda: shift(-1.0))
     later.on_click(lambda: shift(1.0))
     page.follow(show)

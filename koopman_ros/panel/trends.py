@@ -146,12 +146,19 @@ class Trends:
             for marks in self._marks.values():
                 del marks[bisect_right(marks, time, key=_time):]
 
-    def interrupt(self) -> None:
-        """Add a gap after the last value of each pen."""
+    def interrupt(self, pens: Iterable[str] | None = None) -> None:
+        """Add a gap after the last value of pens, by default of all."""
         with self._lock:
-            for pen in self._pens.values():
+            for pen in [self._pens[name] for name in (self._pens if pens is None else pens)
+                        if name in self._pens]:
                 if math.isfinite(pen.last):
                     pen.add(math.nextafter(pen.last, math.inf), math.nan)
+
+    @property
+    def pens(self) -> tuple[str, ...]:
+        """Names of all pens."""
+        with self._lock:
+            return tuple(self._pens)
 
     def window(self, pens: Iterable[str], begin: float, end: float, buckets: int = 600
                ) -> dict[str, tuple[Array, Array]]:

@@ -13,6 +13,7 @@ import re
 from types import MappingProxyType
 from typing import Any
 
+from koopman_ros.core.message_fields import base_name
 from koopman_ros.core.paths import backup_path
 from koopman_ros.core.status import level_words
 from koopman_ros.core.units import conversion, display_unit, printed
@@ -63,6 +64,7 @@ class LoopViewModel:
             {name: self._all[name] for name in of}
             for of in (signals.states, signals.inputs, signals.disturbances))
         self._time = math.nan
+        self._arrived: dict[str, float] = {}  # wall time of the last values, by kind
         self._unplanned = 0
         self._mode = self._level = ''
         self._estimates: tuple[tuple[str, str], ...] = ()
@@ -91,6 +93,11 @@ class LoopViewModel:
         """Take values of signals in their own units, by the kind of their topic."""
         if kind == 'measured':
             self._take_time(stamp, now)
+        elif kind in ('commands', 'predicted'):
+            # no line across a silence of the controller
+            if now - self._arrived.get(kind, now) > self.conditions.patience(PLANT):
+                self.trends.interrupt(pen(kind, name) for name in values)
+            self._arrived[kind] = now
         for name, value in values.items():
             read = self._all[name].shown(value)
             self._all[name].values[kind.removesuffix('_disturbances')] = read
@@ -106,7 +113,7 @@ class LoopViewModel:
                     limits, now)
             for name in self.signals.controlled:
                 setpoint = self._states[name].get('active_setpoints')
-                if math.isfinite(setpoint):
+                if math.isfinite(setpoint) and not self.conditions.is_silent(CONTROLLER, now):
                     self._draw(pen('active_setpoints', name), self._time, setpoint)
 
     def _take_time(self, stamp: float, now: float) -> None:
@@ -313,13 +320,21 @@ class LoopViewModel:
                                    '' if no_controller else quality.get(name, ''),
                                    name in self._disturbances)
                          for name, own in {**self._states, **self._disturbances}.items()),
-            inputs=tuple(own.input(self._bounds(own), silent, self._level)
+            inputs=tuple(own.input(self._bounds(own), silent, self._level,
+                                   self._dead_time(own, control.values))
                          for own in self._inputs.values()),
             estimates=self._estimates, statuses=MappingProxyType(dict(self.conditions.statuses)),
             standing=self.alarms.standing, shelved=self.alarms.shelved,
             stale=self.conditions.stale(now), silences=silences,
             parameters=MappingProxyType(dict(self._parameters)), model=self._about,
             previous_model=self._previous_model)
+
+    def _dead_time(self, own: SignalValues, control: Mapping[str, str]) -> float:
+        label = f'{base_name(own.name, own.unit)} ' if len(self._inputs) > 1 else ''
+        try:
+            return float(control.get(f'{label}dead time [s]', 'nan'))
+        except ValueError:
+            return math.nan
 
     def limited(self, name: str, value: float) -> float:
         """Return a manual command within the limits of the controller, as people read it."""

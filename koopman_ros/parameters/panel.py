@@ -104,6 +104,9 @@ class PanelParameters(SignalParameters):
     alarm_file: str = parameter(
         '', 'File that keeps alarms, shelving and the last 24 hours across restarts; empty: '
             'none.', read_only=True)
+    history_file: str = parameter(
+        '', 'File (.npz) that keeps trends, events and actions across restarts; empty: none.',
+        read_only=True)
     command_timeout: float = parameter(
         5.0, 'Longest time from what a page showed when a control was pressed to its arrival; a '
              'later press is refused.', 's', 1.0, 60.0, read_only=True)

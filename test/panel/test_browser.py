@@ -446,7 +446,7 @@ def test_parameters_are_set_checked_and_rejected(site: Site) -> None:
 
 # Controls that are not disabled.
 USABLE = """controls => controls.filter(own => own.checkVisibility() && !own.disabled
-    && own.innerText !== 'Export YAML').map(own => own.outerHTML)"""
+    && own.innerText !== 'Export YAML' && !own.closest('.view')).map(own => own.outerHTML)"""
 
 
 def test_a_viewer_on_a_phone_sees_operator_actions_and_cannot_act(site: Site) -> None:
@@ -486,7 +486,7 @@ def test_a_controller_that_is_gone_has_a_banner_until_it_is_back(site: Site) -> 
     with site.page() as page:
         ready(page)
         site.controller.stop()
-        banner = page.locator('.banner:not(#lost)')
+        banner = page.locator('.banner:not(#lost, #unsent)')
         expect(banner).to_have_text(re.compile(
             r'⚠ Connection lost: no message from the controller since \d\d:\d\d:\d\d'))
         expect(page.locator('header')).to_contain_text('MODE NOT KNOWN')
