@@ -68,7 +68,9 @@ class StatusCode(Enum):
         'the {level:level} (the data span {ranges:ranges})')
     LAW_FAILED = 'law_failed', 'the {level:level} failed: {cause}'
     HELD_TOO_LONG = 'held_too_long', '{cause}; held for longer than {timeout:g} s'
-    RECOVERING = 'recovering', '{cause} (cleared; waiting for recovery_time)'
+    RECOVERING = 'recovering', (
+        '{cause}: this has ended; the better law acts again when it has stayed away for '
+        'recovery_time')
     SAFE_LATCHED = 'safe_latched', (
         '{cause}; the safe state is latched: remove the cause, then clear it on the panel or by '
         'the service clear_safe_state')
@@ -112,22 +114,24 @@ class StatusCode(Enum):
         'the calculation failed ({error}): the estimate restarts from the next measurement')
     LAW_RAISED = 'law_raised', 'calculation failed ({error})'
     SETPOINT_NOT_FINITE = 'setpoint_not_finite', (
-        '{signal} set-point {value:value} is not finite: the previous one is kept')
+        '{signal} set-point {value:value} is not finite: the previous set-point is kept')
     SETPOINT_UNMEASURED = 'setpoint_unmeasured', (
-        '{signal} set-point {value:value} cannot be tracked, because {cause}: the previous one is '
-        'kept; send it again when measurements return, or command the input in manual mode')
+        '{signal} set-point {value:value} cannot be tracked, because {cause}: the previous '
+        'set-point is kept; send it again when measurements return, or command the input in '
+        'manual mode')
     SETPOINT_OUTSIDE = 'setpoint_outside', (
         '{signal} set-point {value:value} is outside the trained range {lower:value} to '
-        '{upper:value}: the previous one is kept; choose one inside, or load a model trained over '
-        'a wider range')
+        '{upper:value}: the previous set-point is kept; choose one inside, or load a model '
+        'trained over a wider range')
     SETPOINT_NOT_TRIED = 'setpoint_not_tried', (
-        'the check whether the set-point can be held failed ({error}): the previous one is kept')
+        'the check whether the set-point can be held failed ({error}): the previous set-point is '
+        'kept')
     SETPOINT_NOT_HELD = 'setpoint_not_held', (
-        '{signal} set-point {value:value} cannot be held, because {cause}: the previous one is '
-        'kept; the nearest that can be held is {held:values}')
+        '{signal} set-point {value:value} cannot be held, because {cause}: the previous '
+        'set-point is kept; the nearest that can be held is {held:values}')
     NO_SETPOINT_HELD = 'no_setpoint_held', (
         '{signal} set-point {value:value} cannot be held, because {cause}, and no nearby one can: '
-        'the previous one is kept; check the range of the inputs')
+        'the previous set-point is kept; check the range of the inputs')
     INPUT_NEEDED = 'input_needed', (
         '{signal} would have to be {value:value}, but its range is {lower:value} to {upper:value}')
     STATE_LEAVES = 'state_leaves', (
@@ -145,13 +149,13 @@ class StatusCode(Enum):
     NOT_IN_MANUAL_MODE = 'not_in_manual_mode', (
         'manual command rejected in automatic mode: switch to manual mode first')
     MANUAL_NOT_FINITE = 'manual_not_finite', (
-        'manual {signal} {value:value} is not finite: the previous one is kept')
+        'manual {signal} {value:value} is not finite: the previous command is kept')
     EXPERIMENT_BOUNDS = 'experiment_bounds', (
         'the {signal} {value:value} is outside the bounds of the experiment, {lower:value} to '
         '{upper:value}')
     CLOCK_WENT_BACK = 'clock_went_back', 'the stamps of the measurements went back'
     SILENCE = 'silence', 'no newer measurement for more than {timeout:g} s: check sensor and plant'
-    OTHER_PUBLISHER = 'other_publisher', '{nodes} also publishes on {topic}'
+    OTHER_PUBLISHER = 'other_publisher', '{nodes} sends values on {topic}, too'
     ENDED_EARLY = 'ended_early', 'it was stopped before the first measurement'
     CONTROLLER_GONE = 'controller_gone', 'the controller no longer runs'
     NOT_FOLLOWED = 'not_followed', (

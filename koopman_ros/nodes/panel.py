@@ -203,7 +203,7 @@ class PanelNode(LoopNode):
 
     @property
     def title(self) -> str:
-        """Title of all pages: by default the namespace, which tells loops apart, and the plant."""
+        """Title of all pages: by default the namespace and the plant."""
         return self.settings.title or ' '.join(filter(None, (
             self.get_namespace().strip('/'), self.snapshot.plant or self.settings.system)))
 

@@ -55,7 +55,7 @@ class Alarm:
 
     @property
     def source(self) -> str:
-        """The node of its condition, or what is watched."""
+        """The node of its condition, or process."""
         return self.key.partition(':')[0].removeprefix('silence of ').partition(',')[0]
 
 

@@ -4,7 +4,7 @@
 """Conditions of a loop that raise alarms: statuses, repeated errors, and silence of nodes."""
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import re
 
 from koopman_ros.panel.alarms import Alarm, Alarms, Priority
@@ -70,16 +70,26 @@ def grouped(alarms: Sequence[Alarm]) -> list[tuple[Alarm, Sequence[Alarm]]]:
     return [(alarm, causes[alarm.key]) for alarm in alarms if alarm in heads]
 
 
+def _said(task: str, text: str) -> str:
+    """Write the text of a status after its node and task, once each."""
+    node, _, what = task.partition(': ')
+    return f'{node}: {text}' if what and text.startswith(f'{what} ') else f'{task}: {text}'
+
+
 class Conditions:
     """
     Last statuses and messages of a loop, and their alarms.
 
     :param nodes: roles of the loop's nodes by their full names without the first slash.
     :param now: wall time, as in all methods; if it jumps back, all ages stay as they are.
+    :param signals: names that are written in words in messages.
     """
 
-    def __init__(self, nodes: Mapping[str, str], now: float) -> None:
+    def __init__(self, nodes: Mapping[str, str], now: float, signals: Iterable[str] = ()) -> None:
         self.alarms = Alarms()
+        # names of signals in sentences, but not in topics, parameters and paths
+        names = '|'.join(re.escape(name) for name in signals if '_' in name) or r'(?!)'
+        self._names = re.compile(rf'(?<![\w./])({names})(?![\w/]|\.\w)')
         self.plant = ''  #: name of the plant
         self.statuses: dict[str, TaskStatus] = {}
         self._nodes, self._start, self._now = dict(nodes), now, now
@@ -134,6 +144,7 @@ class Conditions:
                 self._watched.append(role)
         if role in (PLANT, CONTROLLER):
             self.plant = plant or self.plant
+        message = self._in_words(message)
         before = self.statuses.get(name)
         status = self.statuses[name] = TaskStatus(
             name, level, message or ('' if level == OK else 'no reason was given'), dict(values))
@@ -146,7 +157,8 @@ class Conditions:
             Priority.MEDIUM if role == CONTROLLER else Priority.LOW))
         active = level > OK and self._is_alarm(status, now)
         # one alarm a condition, which is its sentence without the numbers
-        warnings = [text for key, text in values.items() if key.startswith('warning ')]
+        warnings = [self._in_words(text) for key, text in values.items()
+                    if key.startswith('warning ')]
         texts = {sanitize_text(f'{name}: {_NUMBER.sub("#", text)}', _MAX_NAME): text
                  for text in warnings or [status.message]}
         # of texts that alternate, each would end before the delay
@@ -154,9 +166,12 @@ class Conditions:
             set(texts) & set(self._keys[name]))
         for key in {*self._keys.get(name, ()), *texts}:
             self.alarms.report(key, active and key in texts, priority,
-                               f'{name}: {texts.get(key, "")}', now,
+                               _said(name, texts.get(key, '')), now,
                                0.0 if replaced else None)
         self._keys[name] = tuple(texts)
+
+    def _in_words(self, text: str) -> str:
+        return self._names.sub(lambda found: found[0].replace('_', ' '), text)
 
     def _forget_one(self, tasks: Sequence[str], now: float) -> bool:
         """Make room for an alarm: forget a task without one; return whether there was any."""

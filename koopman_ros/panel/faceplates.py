@@ -84,7 +84,7 @@ class Faceplate:
         return number(value, self.decimals)
 
     def exact(self, value: float) -> str:
-        """Write a value that was asked for, without the unit."""
+        """Write a requested value, without the unit."""
         return exact(value, self.decimals)
 
     def span_text(self, bounds: Range) -> str:
@@ -147,7 +147,7 @@ class SignalValues:
         Return the faceplate of a state, or disturbance, with limits and range of the sensor.
 
         :param silent: roles of nodes.
-        :param quality: of the measurement as the controller has it, in words; empty for good.
+        :param quality: of the measurement for the controller, in words; empty for good.
         """
         measured, setpoint = self.get('measured'), self.get('active_setpoints')
         span = _span([self.training, sensor], [measured, setpoint, *(limits or ())])

@@ -246,7 +246,7 @@ class AnswerLine:
     """
     Line with the answer to an action, next to its control, as long as the answer holds.
 
-    :param basis: what the answer is about; it no longer holds when that changes afterwards.
+    :param basis: state of the loop to which the answer refers; the answer ends when it changes.
     """
 
     def __init__(self, page: PageLayout,

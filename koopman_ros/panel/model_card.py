@@ -25,6 +25,8 @@ _TRAINING = {'step': 'Step', 'model_class': 'Model class',
              'heldout_error_of_linear_model': 'Held-out error of a linear model',
              'closed_loops': 'Simulated closed loops', 'closed_loops_failed': 'of these failed',
              'closed_loop_cost_over_linear': 'Closed-loop cost relative to linear control'}
+_LAWS = {'re-centred': 'linear around the set-point',
+         'averaged': 'linear between state and set-point'}
 _COMPARED = ('Model class', 'Acceptance')
 _OUTSIDE = ' outside training box [half-ranges]'
 _UNKNOWN = ('', 'none', 'nan')
@@ -110,6 +112,7 @@ def training_card(values: Mapping[str, str]) -> dict[str, str]:
 def status_card(values: Mapping[str, str]) -> dict[str, str]:
     """Return the figures of the model in the controller's status, by their names in words."""
     found = {title: values.get(key, '') for key, title in _STATUS.items()}
+    found['Control law'] = _LAWS.get(found['Control law'], found['Control law'])
     with contextlib.suppress(ValueError):
         # in local time, as the other times on the page
         written = datetime.fromisoformat(found['File written']).astimezone()

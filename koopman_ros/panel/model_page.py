@@ -218,7 +218,8 @@ def _experiment(page: PageLayout) -> None:
         obstacle.set_text(f'Start is not possible: {reason}')
         show_if(obstacle, bool(reason))
         page.allow(begin, not reason, reason)
-        page.allow(end, bool(now.experiment), 'no experiment is running')
+        # also one that is over and still holds the inputs
+        page.allow(end, 'topic' in found.values, 'no experiment is running')
         task.show(found, {'time left [s]' if key == 'left [s]' else key: value
                           for key, value in found.values.items()})
         limits.set_text('\n'.join(experiment_limits(now)))

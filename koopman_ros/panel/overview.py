@@ -88,7 +88,7 @@ class _Entry:
     """
     Entry of a number: typed, stepped by the arrow keys, or by a slider.
 
-    :param present: the value that is asked for at present.
+    :param present: the requested value at present.
     """
 
     def __init__(self, page: PageLayout, title: str, send: Callable[[float], Any],

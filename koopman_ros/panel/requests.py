@@ -66,7 +66,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class AuditEntry:
-    """An action with its answer, as the audit log has it."""
+    """An action with its answer, in the audit log."""
 
     stamp: float  #: wall time
     who: str

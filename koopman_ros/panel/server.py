@@ -260,7 +260,7 @@ def _guard_sockets(keeper: AccessControl, command_timeout: float) -> None:
     Let a socket act on pages of its own session: NiceGUI checks the id of a page alone.
 
     A press on a page carries the panel's time that the page showed. One that was on its way for
-    too long is refused, and the page is told.
+    too long is refused, and the page shows it.
     """
     sockets = core.sio
 

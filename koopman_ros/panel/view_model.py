@@ -55,7 +55,8 @@ class LoopViewModel:
     def __init__(self, signals: Signals, read: Mapping[str, str], span: float, now: float,
                  nodes: Mapping[str, str] = ROLES) -> None:
         self.signals, self.read = signals, read
-        self.conditions, self.trends = Conditions(nodes, now), Trends(span)
+        self.conditions, self.trends = (
+            Conditions(nodes, now, signals.units), Trends(span))
         self.alarms = self.conditions.alarms
         self._span = span
         self._all = {name: SignalValues(name, unit, read[name])
@@ -242,7 +243,7 @@ class LoopViewModel:
                 own.values.pop(kind, None)
 
     def _change(self, mark: str, own: SignalValues, kind: str, value: float, by: str) -> None:
-        """Take a value that was asked for, and mark its change in the trends."""
+        """Take a requested value, and mark its change in the trends."""
         fallback = own.get('active_setpoints' if kind == 'target' else 'commands')
         before, own.values[kind] = own.get(kind, fallback), value
         if before != value:

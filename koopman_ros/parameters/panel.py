@@ -62,7 +62,7 @@ class ShownDisturbance(MeasuredPlace):
 
 @dataclass(frozen=True)
 class ProcessLimits:
-    """Limits of a measurement, in the unit in which people read it; an infinity is no limit."""
+    """Limits of a measurement, in the unit in which people read it; an infinity for none."""
 
     high: float = math.inf
     low: float = -math.inf
@@ -108,8 +108,8 @@ class PanelParameters(SignalParameters):
         '', 'File (.npz) that keeps trends, events and actions across restarts; empty: none.',
         read_only=True)
     command_timeout: float = parameter(
-        5.0, 'Longest time from what a page showed when a control was pressed to its arrival; a '
-             'later press is refused.', 's', 1.0, 60.0, read_only=True)
+        5.0, 'Longest time from the press of a control on a page to its arrival here; a later '
+             'one is refused.', 's', 1.0, 60.0, read_only=True)
     span: float = parameter(
         28800.0, 'Length of the trends.', 's', 600.0, 604800.0, read_only=True)
     alarm_high: Array = value_column(

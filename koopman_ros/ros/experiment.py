@@ -110,8 +110,8 @@ class PlantExperiment:
             return False, 'no experiment is running'
         if self._run.running:
             self._run.stop(ExperimentPhase.ENDED)
-            return True, (f'ended: {self._run.return_text}; call again with data: false to '
-                          'release the inputs')
+            return True, (f'ended: {self._run.return_text}; end it once more to release the '
+                          'inputs')
         self._release(self._verdict(self._run))
         return True, 'the trainer has released the inputs'
 

@@ -154,7 +154,7 @@ class ExperimentRun:
     @property
     def return_text(self) -> str:
         """Values to which the signals return after the steps."""
-        return f'{self._values_text("to", self.plan.home)}, held there'
+        return f'{self._values_text("to", self.plan.home)}, where it is held'
 
     def _values_text(self, preposition: str, values: Array) -> str:
         """Write values (m,) with their names and units."""

@@ -122,7 +122,7 @@ def test_a_setpoint_of_a_volatile_publisher_is_received_and_the_active_one_latch
     status = bench.status(lambda s: 'set-point' in s.message)
     assert status.level == DiagnosticStatus.WARN
     assert 'set-point 80.00 degC is outside the trained range' in status.message
-    assert 'the previous one is kept' in status.message
+    assert 'the previous set-point is kept' in status.message
     # a plotting tool that does not match hides it no more than it hides that
     latched = bench.ros.node.create_subscription(
         Temperature, reactor.PREDICTED_TEMPERATURE, lambda _: None, topics.LATCHED_QOS)

@@ -160,8 +160,7 @@ def test_service_ends_the_steps_and_then_lets_go(shared_bench: Bench) -> None:
     assert bench.answer() != pytest.approx(SAFE, abs=0.5)
     assert value(bench.status('running'), 'topic') == JACKET
 
-    assert bench.ask(False)[1] == ('ended: coolant to 18.85 degC, held there; call again with '
-                                   'data: false to release the inputs')
+    assert bench.ask(False)[1].startswith('ended: coolant to 18.85 degC')
     bench.status('ended; coolant to 18.85 degC')
     for _ in range(20):
         bench.answer()
@@ -197,9 +196,8 @@ def test_another_commander_ends_it_at_once_and_rejects_the_next(shared_bench: Be
     status = bench.status('aborted')
     assert status.level == DiagnosticStatus.ERROR
     # found, perhaps, before its name is
-    assert status.message.removeprefix('aborted: ') in (
-        '/bench also publishes on /unit_1/jacket',
-        'another node also publishes on /unit_1/jacket')
+    assert status.message.startswith(('aborted: /bench sends', 'aborted: another node sends'))
+    assert JACKET in status.message
     ros.wait_until(lambda: ros.node.count_publishers(JACKET) == 1)
     assert ros.wait_until(lambda: '/bench publishes' in (answer := bench.start())[1]
                           and answer) == (

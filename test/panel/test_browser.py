@@ -479,7 +479,7 @@ def test_a_viewer_on_a_phone_sees_operator_actions_and_cannot_act(site: Site) ->
         beat = page.locator('#beat')
         expect(beat).not_to_have_attribute('data-beat', beat.get_attribute('data-beat') or '')
         assert phone.request.get(f'{site.url}/logout').ok
-        page.wait_for_url(re.compile(r'/login\?page=/tuning$'))
+        page.wait_for_url(re.compile(r'/login\?page=/audit$'))
 
 
 def test_a_controller_that_is_gone_has_a_banner_until_it_is_back(site: Site) -> None:
