@@ -4,7 +4,7 @@
 """The panel node: shows the loop in a browser, and forwards the commands of operators."""
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
@@ -102,8 +102,8 @@ class PanelNode(LoopNode):
             self.resolve_service_name(name).lstrip('/'): role for role, name in nodes.items()})
         self.view.limits = settings.limits(signals)
         self.follow_table(table, settings, self._on_parameters)
-        self._store = self._open_store(settings.alarm_file)
-        self._history = self._open_history(settings.history_file)
+        self._files = [*self._opened('alarm_file', AlarmStore, self.view.alarms),
+                       *self._opened('history_file', HistoryFile, self.view)]
         self.snapshot = self.view.snapshot(time.time())
         self._words = words_of(signals, {
             name: Display(unit, read[name], '.6g') for name, unit in signals.units.items()
@@ -155,28 +155,20 @@ class PanelNode(LoopNode):
         self.create_subscription(
             ParameterEvent, '/parameter_events', self._on_event, QoSProfile(depth=1000))
 
-    def _open_store(self, path: str) -> AlarmStore | None:
-        if not path:
-            return None
+    def _opened(self, parameter: str, kind: type[Any], of: Any
+                ) -> Iterator[AlarmStore | HistoryFile]:
+        """Open the file of a parameter, if it names one."""
+        if not (path := getattr(self.settings, parameter)):
+            return
         try:
-            store = AlarmStore(self.view.alarms, Path(path), time.time())
+            file = kind(of, Path(path), time.time())
         except (OSError, ValueError) as error:
             raise ConfigurationError(
-                f'alarm_file = {path!r} cannot be used ({error}): name a new file in a writable '
+                f'{parameter} = {path!r} cannot be used ({error}): name a new file in a writable '
                 'folder, or a file written by a panel') from error
-        if store.complaint:
-            self.get_logger().warning(store.complaint)
-        return store
-
-    def _open_history(self, path: str) -> HistoryFile | None:
-        if not path:
-            return None
-        try:
-            return HistoryFile(self.view, Path(path), time.time())
-        except (OSError, ValueError) as error:
-            raise ConfigurationError(
-                f'history_file = {path!r} cannot be used ({error}): name a new file in a writable '
-                'folder, or a file written by a panel') from error
+        if file.complaint:
+            self.get_logger().warning(file.complaint)
+        yield file
 
     def _serve(self) -> Any:
         try:
@@ -196,7 +188,7 @@ class PanelNode(LoopNode):
         """Stop the pages, and save the alarms."""
         self._watch.complete()
         self._server.stop()
-        for file in filter(None, (self._store, self._history)):
+        for file in self._files:
             file.close()
 
     # For the pages; called from their thread.
@@ -284,7 +276,7 @@ class PanelNode(LoopNode):
     def _on_timer(self) -> None:
         now = time.time()
         self.view.advance(now)
-        for file in filter(None, (self._store, self._history)):
+        for file in self._files:
             try:
                 file.save(now)
             except OSError as error:

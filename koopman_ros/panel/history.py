@@ -9,6 +9,7 @@ import json
 import math
 import os
 from pathlib import Path
+from typing import Any
 import zipfile
 
 import numpy as np
@@ -31,10 +32,13 @@ class HistoryFile:
     The file is bounded: of a long history it holds the extremes of each pen.
 
     :param path: of the file, which may be missing.
+    :ivar complaint: always empty, because a damaged file is an error.
     :param now: wall time.
     :raises ValueError: for a file that no panel wrote, which is not replaced.
     :raises OSError: for a file that cannot be read, or a folder that cannot be written.
     """
+
+    complaint = ''
 
     def __init__(self, view: LoopViewModel, path: Path, now: float) -> None:
         self._view, self._path, self._due = view, Path(os.path.realpath(path)), now + _INTERVAL
@@ -73,7 +77,9 @@ class HistoryFile:
         text = json.dumps({'marks': [asdict(one) for one in trends.marks(-math.inf, math.inf)],
                            'audit': [asdict(one) for one in self._view.audit]})
         content = io.BytesIO()
-        np.savez(content, **{_TEXTS: np.array(text)}, **{
-            name: np.array(of) for name, of in pens.items() if len(of[0])})
+        arrays: dict[str, Any] = {
+            _TEXTS: np.array(text),
+            **{name: np.array(of) for name, of in pens.items() if len(of[0])}}
+        np.savez(content, **arrays)
         self._path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(self._path, content.getvalue(), 0o600)

@@ -72,7 +72,11 @@ def trend_page(page: PageLayout) -> None:
 
     for control in (span, whole, until):
         control.on_value_change(change)
-    present.on_click(lambda: (until.set_value(''), chart.reset()))
+    def follow() -> None:
+        until.set_value('')
+        chart.reset()
+
+    present.on_click(follow)
     earlier.on_click(lambda: shift(-1.0))
     later.on_click(lambda: shift(1.0))
     page.follow(show)

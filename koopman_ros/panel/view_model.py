@@ -70,6 +70,7 @@ class LoopViewModel:
         self._mode = self._level = ''
         self._estimates: tuple[tuple[str, str], ...] = ()
         self._parameters: dict[str, Mapping[str, ParameterDescription]] = {}
+        self._before: dict[tuple[str, str], str] = {}  # values before, by role and name
         self._marked = now  # time of the last alarm that is a mark in the trends
         self._about: Mapping[str, str] = MappingProxyType({})
         self._previous_model = ''
@@ -224,10 +225,8 @@ class LoopViewModel:
             case 'model':
                 self._replace_model(fields['model'], by)
             case 'parameters':
-                if changes := ', '.join(
-                        f'{name}: {found.text if (found := known.get(name)) else "–"} → {value}'
-                        for known in [self._parameters.get(CONTROLLER, {})]
-                        for name, value in dict(fields['parameters']).items()):
+                if changes := ', '.join(self._parameter_change(name, value) for name, value
+                                        in dict(fields['parameters']).items()):
                     self._mark('parameter', f'{changes}{by}')
                 if 'model' in fields:
                     self._replace_model(fields['model'], by)
@@ -241,6 +240,14 @@ class LoopViewModel:
         for own in self._all.values():
             for kind in kinds:
                 own.values.pop(kind, None)
+
+    def _parameter_change(self, name: str, value: Any) -> str:
+        found = self._parameters.get(CONTROLLER, {}).get(name)
+        # the parameter may have been read before its record is here
+        known = found.text if found and found.value != value else (
+            self._before.get((CONTROLLER, name), '–'))
+        return f'{name}: {known} → {value:.10g}' if isinstance(value, float) else (
+            f'{name}: {known} → {value}')
 
     def _change(self, mark: str, own: SignalValues, kind: str, value: float, by: str) -> None:
         """Take a requested value, and mark its change in the trends."""
@@ -268,6 +275,9 @@ class LoopViewModel:
 
     def take_parameters(self, role: str, values: Mapping[str, ParameterDescription]) -> None:
         """Take all parameters of a node; none if it is gone."""
+        before = self._parameters.get(role, {})
+        self._before |= {(role, name): found.text for name, found in before.items()
+                         if name in values and values[name].value != found.value}
         self._parameters[role] = MappingProxyType(dict(values))
 
     def take_model(self, ranges: Mapping[str, Range], about: Mapping[str, str]) -> None:

@@ -305,7 +305,7 @@ def asks_for_all_that_there_is(desk: Panel, controller: NodeProcess) -> None:
     # each with its person, before the value and after
     desk.wait(lambda: {
         ('set-point', 'temperature 45 → 46 °C by anna'), ('mode', 'automatic → manual by anna'),
-        ('parameter', 'coolant_temperature.max: 32 → 30.0 by anna')} <= {
+        ('parameter', 'coolant_temperature.max: 32 → 30 by anna')} <= {
         (mark.kind, mark.text) for mark in node.view.trends.marks(0.0, 1e12)})
     assert controller.stop() == 0
     desk.wait(lambda: not node.count_publishers(topics.EVENT_LOG))
