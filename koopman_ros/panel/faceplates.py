@@ -129,6 +129,7 @@ class SignalValues:
     unit: str
     read: str  #: unit in which people read it
     values: dict[str, float] = field(default_factory=dict)
+    before: dict[str, float] = field(default_factory=dict)  # other values before these
     training: Range | None = None
     active: str = ''
     plan: tuple[tuple[float, float], ...] = ()

@@ -102,7 +102,10 @@ class LoopViewModel:
             self._arrived[kind] = now
         for name, value in values.items():
             read = self._all[name].shown(value)
-            self._all[name].values[kind.removesuffix('_disturbances')] = read
+            own, key = self._all[name], kind.removesuffix('_disturbances')
+            if own.get(key) != read:
+                own.before[key] = own.get(key)
+            own.values[key] = read
             # a latched set-point has the stamp of its beginning
             if math.isfinite(read) and kind != 'active_setpoints':
                 self._draw(pen(kind, name), stamp, read)
@@ -251,7 +254,9 @@ class LoopViewModel:
 
     def _change(self, mark: str, own: SignalValues, kind: str, value: float, by: str) -> None:
         """Take a requested value, and mark its change in the trends."""
-        fallback = own.get('active_setpoints' if kind == 'target' else 'commands')
+        sent = 'active_setpoints' if kind == 'target' else 'commands'
+        # the controller may have followed before its record is here
+        fallback = own.before.get(sent, math.nan) if own.get(sent) == value else own.get(sent)
         before, own.values[kind] = own.get(kind, fallback), value
         if before != value:
             self._mark(mark, f'{readable(own.name)} {before:.6g} → {value:.6g} '
