@@ -227,7 +227,7 @@ def test_the_most_urgent_alarm_is_on_every_page_and_in_the_title(desk: Desk) -> 
         sound.click()
         expect(sound).to_have_attribute('aria-pressed', 'true')
         sound.click()
-        strip.get_by_role('button', name='Acknowledge: pump: motor: motor tripped').click()
+        strip.get_by_role('button', name='Acknowledge: pump: motor tripped').click()
         expect(strip).to_contain_text('bearing warm')
         for key in ('pump: bearing: bearing warm', 'pump: motor: motor tripped'):
             assert loop.view.alarms.shelve(key, 600.0, 'otto', time.time())
@@ -299,7 +299,8 @@ def test_an_experiment_is_on_every_page_and_a_set_point_asks_before_it_ends_it(
                                        '5.0 to 32.0 °C')
         assert '10 °C' not in dialog.inner_text()
         page.keyboard.press('Escape')
-        loop.status('trainer: experiment', OK, 'running', {'left [s]': '812'})
+        loop.status('trainer: experiment', OK, 'running', {
+            'topic': '/setpoint', 'left [s]': '812'})
         expect(experiment.get_by_role('button', name='End')).to_be_enabled()
         for path in ('/trends', '/'):
             page.goto(f'{desk.url}{path}')
