@@ -23,7 +23,7 @@ from koopman_ros.core.arrays import Array, read_only
 from koopman_ros.core.plugins import contained
 from koopman_ros.core.signals import numbers
 from koopman_ros.core.status import Reason, reason, StatusCode, UNMEASURED
-from koopman_ros.core.units import NANOSECONDS
+from koopman_ros.core.units import NANOSECONDS, nanoseconds
 from koopman_ros.estimation import equivalent_bias, Estimate, History
 
 
@@ -65,7 +65,7 @@ class Controller(ControlStep):
         if not asked or len(set(asked)) != len(asked) or not set(asked) <= set(every.names):
             raise ValueError(f'signals must be some of {", ".join(every.names)}, each once, got '
                              f'{list(asked)}')
-        value = numbers('set-point', value, asked)
+        value, effective_ns = numbers('set-point', value, asked), nanoseconds(effective_ns)
         rejection = setpoints.rejection(every.only(asked), value)
         if rejection is not None:
             return state, rejection
@@ -151,7 +151,7 @@ class Controller(ControlStep):
 
         :return: as :meth:`request_setpoint`.
         """
-        instants, found = state.history.instants, None
+        instants, found, stamp_ns = state.history.instants, None, nanoseconds(stamp_ns)
         newest_ns, oldest_ns = (
             instants[at].time_ns if instants else stamp_ns for at in (-1, 0))
         try:

@@ -42,6 +42,8 @@ _MOST_EVALUATIONS = 20
 # A prediction takes steps of at least this share of the fastest time constant, and an estimator at
 # most so many of them at once.
 _PREDICTION_STEP, _MOST_STEPS = 0.1, 10
+# It spans at most so many of the fastest time constants: a step of a larger one takes seconds.
+_LONGEST_PREDICTION = 1000.0
 
 
 class _NotPredictedError(Exception):
@@ -205,6 +207,8 @@ class FallbackLevel:
         model, ahead, gathered, impulse = self.model, 0.0, 0.0, np.zeros(self.model.n_u)
         rate = model.linearised.fastest_rate / model.seconds_per_time_unit
         step = _PREDICTION_STEP / rate if rate > 0.0 else math.inf
+        if not sum(seconds for seconds, _ in pieces) * rate <= _LONGEST_PREDICTION:
+            raise _NotPredictedError(_LONGEST_PREDICTION / rate)
         for k, (seconds, u) in enumerate(pieces, 1):
             # of short pieces the mean acts as they do one by one
             gathered, impulse = gathered + seconds, impulse + seconds * u

@@ -54,6 +54,8 @@ class State(NamedTuple):
     #: applied inputs that act, or will act; empty before the first command
     applied: AppliedInputs = AppliedInputs()
     interval: float = np.inf  #: usual seconds between measurements; infinity before the second
+    #: seconds after the last measurement that ramp and rate limit have counted already
+    counted: float = 0.0
     accepted: Accepted | None = None  #: the last accepted measurement
     #: state and disturbance, in the deviations of the acting level's model
     estimate: Estimate | None = None

@@ -38,12 +38,18 @@ from koopman_ros.control.state import (
     WITHOUT_LAW,
 )
 from koopman_ros.control.supervisor import HOLD, LevelRequest, MANUAL, SAFE, Supervisor
-from koopman_ros.control.timing import afresh, StepTime, time_of_measurement, time_of_silence
+from koopman_ros.control.timing import (
+    afresh,
+    check_interval,
+    StepTime,
+    time_of_measurement,
+    time_of_silence,
+)
 from koopman_ros.core.arrays import all_finite, Array, read_only
 from koopman_ros.core.plugins import contained
 from koopman_ros.core.signals import numbers
 from koopman_ros.core.status import Reason, reason, StatusCode
-from koopman_ros.core.units import LATE_NANOSECONDS
+from koopman_ros.core.units import LATE_NANOSECONDS, nanoseconds
 from koopman_ros.estimation import Estimate, History, Verdict
 
 
@@ -75,9 +81,10 @@ class ControlStep(Configuration):
             good.
         :return: the new state, the command (n_u,) in input units, always finite and within the
             limits, and the report.
+        :raises TypeError: for a time that is not an integer.
         :raises ValueError: for a measurement or an input of another size.
         """
-        y = numbers('measurement', y, self.measured.names)
+        y, time_ns = numbers('measurement', y, self.measured.names), nanoseconds(time_ns)
         if applied is not None:
             applied = numbers('applied input', applied, self.model.inputs.names)
         if disturbances is not None and (signals := self.model.disturbances.names):
@@ -93,6 +100,7 @@ class ControlStep(Configuration):
         if back:
             state = afresh(state, ahead)
         time, missed = time_of_measurement(state, time_ns, countable)
+        check_interval(self.model, state.interval, time.interval)
 
         def calculate() -> tuple[State, Array, StepReport]:
             known, follows = self.estimation.applied(state, applied)
@@ -123,7 +131,7 @@ class ControlStep(Configuration):
             predicts.
         :return: as :meth:`step`; the command is None before the first.
         """
-        held = state.command
+        held, time_ns = state.command, nanoseconds(time_ns)
         if held is None:
             return state, None, self._report(state, None)
         time = time_of_silence(state, time_ns)
@@ -230,8 +238,12 @@ class ControlStep(Configuration):
         done = done._replace(at_range=done.at_range or at_range, at_rate=at_rate,
                              outside=self.model.inputs.violation(u))
         applied = state.applied.followed_by(time.command_ns, u, self.estimation.dead_ns)
+        # a command that is held leaves its time to the next one
+        held = measured.arrival is Arrival.MISSING and state.mode is Mode.AUTOMATIC and (
+            changes['supervisor'].level == HOLD)
         state = state._replace(**changes, command=u, commanded_ns=time.command_ns,
-                        applied=applied, interval=time.interval)
+                        applied=applied, interval=time.interval,
+                        counted=state.counted if held else time.ahead)
         return state, u, self._report(state, why, measured, target, done)
 
     def _choose(self, state: State, verdict: Verdict, outside: float, time: StepTime

@@ -8,11 +8,12 @@ from __future__ import annotations
 from dataclasses import replace
 import math
 from typing import NamedTuple
+import warnings
 
 from koopman_ros.control.state import State
-from koopman_ros.control.supervisor import HOLD
 from koopman_ros.core.units import LATE_NANOSECONDS, NANOSECONDS
 from koopman_ros.estimation import History
+from koopman_ros.model import LiftedModel
 
 # s that the rate limit counts at most between two commands without a measurement, unless
 # measurements are usually further apart.
@@ -26,8 +27,30 @@ class StepTime(NamedTuple):
     command_ns: int  #: of the command
     elapsed: float  #: seconds since the last command
     counted: float  #: of these, seconds that count for ramp and rate limit
+    ahead: float  #: seconds after the measurement's stamp that have counted before
     spacing: float  #: seconds between samples; 0 when they are not known
     interval: float  #: usual seconds between measurements; infinity before the second
+
+
+def check_interval(model: LiftedModel, before: float, interval: float, share: float = 0.005
+                   ) -> None:
+    """
+    Warn where measurements begin to come much closer together than in the training record.
+
+    :param before: usual seconds between measurements so far, and `interval` with this one.
+    :param share: of the interval of the record that is much closer; stamps in microseconds that
+        are given as nanoseconds have a thousandth of it. For a model without a record, a tenth of
+        its fastest time constant is taken in place of that interval.
+    """
+    recorded = model.provenance.metrics.get('sample_interval', 0.0)
+    fastest = model.linearised.fastest_rate / model.seconds_per_time_unit
+    usual = recorded or (0.1 / fastest if fastest > 0.0 else 0.0)
+    if interval < share * usual <= before:
+        warnings.warn(
+            f'measurements are {interval:.3g} s apart, in the training record they were '
+            f'{recorded:.3g} s apart: check that stamps are in nanoseconds' if recorded else
+            f'measurements are {interval:.3g} s apart, the fastest time constant of the model is '
+            f'{1.0 / fastest:.3g} s: check that stamps are in nanoseconds', stacklevel=3)
 
 
 def usual_interval(state: State) -> float:
@@ -44,7 +67,8 @@ def afresh(state: State, by_ns: int) -> State:
     supervisor = replace(state.supervisor, bad_since_ns=None, better_since_ns=None)
     newest_ns = state.time_ns if state.former_ns is None or state.time_ns is None else max(
         state.time_ns, state.former_ns)
-    return state._replace(time_ns=None, former_ns=newest_ns, commanded_ns=None, accepted=None,
+    return state._replace(time_ns=None, former_ns=newest_ns, commanded_ns=None, counted=0.0,
+                   accepted=None,
                    applied=state.applied.shifted(by_ns), supervisor=supervisor, recovery=None,
                    disturbances=state.disturbances and state.disturbances.shifted(by_ns),
                    setpoint=replace(state.setpoint, scheduled=()), history=History())
@@ -61,26 +85,26 @@ def time_of_measurement(state: State, time_ns: int, countable: float | None
     elapsed = 0.0 if since_ns is None else max(0.0, (time_ns - since_ns) / NANOSECONDS)
     # neither a gap nor a burst is the spacing of the samples, nor the first of them
     spacing = min(usual_interval(state), elapsed)
-    counted, missed, interval = 0.0, 0, state.interval
-    if state.time_ns is not None and elapsed > 0.0:
+    counted, missed, interval, ahead = 0.0, 0, state.interval, 0.0
+    if state.time_ns is not None:
         since_ns = state.time_ns
         if state.former_ns is not None and since_ns < state.former_ns < time_ns:
             # two sources would count each other's time, but for this
             since_ns = state.former_ns
         since = (time_ns - since_ns) / NANOSECONDS
-        if math.isfinite(state.interval):
-            missed = max(0, round(since / state.interval) - 1)
-        # the plant stood under the old command all through a gap
-        seconds = min(since, 2.0 * state.interval)
-        # a burst of measurements does not make the next regular one a gap
-        interval = max(seconds, 0.5 * usual_interval(state))
-        counted = min(seconds, elapsed)
-    if ahead_of_stamps and state.supervisor.level != HOLD:
-        # the command has moved in that time already
-        counted = 0.0
+        # the command has moved already while nothing was measured
+        left, ahead = max(0.0, since - state.counted), max(0.0, state.counted - since)
+        if elapsed > 0.0:
+            if math.isfinite(state.interval):
+                missed = max(0, round(since / state.interval) - 1)
+            # the plant stood under the old command all through a gap
+            seconds = min(since, 2.0 * state.interval)
+            # a burst of measurements does not make the next regular one a gap
+            interval = max(seconds, 0.5 * usual_interval(state))
+            counted = min(seconds, elapsed, left)
     if countable is not None:
         counted = min(counted, countable)
-    return StepTime(time_ns, time_ns, elapsed, counted, spacing, interval), missed
+    return StepTime(time_ns, time_ns, elapsed, counted, ahead, spacing, interval), missed
 
 
 def time_of_silence(state: State, time_ns: int) -> StepTime:
@@ -89,4 +113,8 @@ def time_of_silence(state: State, time_ns: int) -> StepTime:
     elapsed, spacing = max(0.0, (time_ns - since_ns) / NANOSECONDS), usual_interval(state)
     # the command stood still all through a longer silence
     counted = min(elapsed, max(_LONGEST_WATCH, 2.0 * spacing))
-    return StepTime(time_ns, max(time_ns, since_ns), elapsed, counted, spacing, state.interval)
+    command_ns = max(time_ns, since_ns)
+    # of another clock than the stamps', no more than has passed since the last of these
+    passed = 0.0 if state.time_ns is None else (command_ns - state.time_ns) / NANOSECONDS
+    ahead = min(state.counted + counted, max(passed, state.counted))
+    return StepTime(time_ns, command_ns, elapsed, counted, ahead, spacing, state.interval)

@@ -102,6 +102,18 @@ def change_within(rate: Array, seconds: float) -> Array:
     return rate * seconds if seconds > 0.0 else np.where(np.isinf(rate), np.inf, 0.0)
 
 
+def pseudo_inverse(A: Array) -> Array:
+    """
+    Return the pseudo-inverse (..., n, m) of matrices (..., m, n).
+
+    :raises numpy.linalg.LinAlgError: for numbers that are not finite, for which LAPACK's singular
+        value decomposition may never end.
+    """
+    if not np.isfinite(A).all():
+        raise np.linalg.LinAlgError('the pseudo-inverse of a matrix that is not finite')
+    return np.asarray(np.linalg.pinv(A), dtype=np.float64)
+
+
 def all_finite(vector: Array) -> bool:
     """Return whether all numbers (n,) are finite, for a few of them in a fifth of NumPy's time."""
     return all(map(math.isfinite, vector.tolist()))

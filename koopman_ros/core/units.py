@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 import math
+import operator
 import re
 from typing import Any, TypeVar
 
@@ -225,6 +226,15 @@ def to_kelvin(celsius: float) -> float:
 def to_celsius(kelvin: float) -> float:
     """Convert a temperature to degrees Celsius."""
     return kelvin - ZERO_CELSIUS
+
+
+def nanoseconds(time: int) -> int:
+    """Return a time in ns; TypeError unless it is an integer, as a time in seconds is not."""
+    try:
+        return operator.index(time)
+    except TypeError:
+        raise TypeError(f'a time must be an integer of nanoseconds, got {time!r}: pass '
+                        'round(seconds * 1e9)') from None
 
 
 def seconds_text(nanoseconds: int) -> str:

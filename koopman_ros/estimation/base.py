@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from koopman_ros.core.arrays import all_finite, Array
+from koopman_ros.core.arrays import all_finite, Array, pseudo_inverse
 from koopman_ros.core.declaration import NoParameters
 from koopman_ros.core.integration import fastest_rate, integrate, STEPS
 from koopman_ros.core.signals import Outputs
@@ -250,7 +250,7 @@ class Estimator(ABC):
     def _inverse(self) -> Array:
         """(n_u, n_x) of :func:`effect_of_inputs`, and of B at applied inputs behind a lag."""
         rows = [*self.model.lagged.values()]
-        found = np.asarray(np.linalg.pinv(effect_of_inputs(self.model)), dtype=np.float64)
+        found = pseudo_inverse(effect_of_inputs(self.model))
         found[:, rows] = self.model.input_inverse()[:, rows]
         return found
 

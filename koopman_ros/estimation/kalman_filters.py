@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.core.arrays import Array
+from koopman_ros.core.arrays import Array, pseudo_inverse
 from koopman_ros.core.integration import integrate, sensitivity_rate
 from koopman_ros.core.signals import Outputs
 from koopman_ros.core.units import SECONDS_PER_MINUTE
@@ -114,7 +114,7 @@ class ExtendedKalmanFilter(Estimator):
         #: (n_x, n_x) by which the covariance of the disturbance grows in a second
         self._intensity = directions @ directions.T
         #: (n_x, n_x) projection on possible disturbances
-        self._onto_directions = directions @ np.linalg.pinv(directions)
+        self._onto_directions = directions @ pseudo_inverse(directions)
 
     def _directions(self) -> Array:
         """(n_x, n_y) rates of the state that each disturbance adds to, as far as it wanders."""
@@ -125,7 +125,7 @@ class ExtendedKalmanFilter(Estimator):
         moved = np.max(np.abs(H @ by_input), axis=1)
         usual = np.max(moved / sizes, initial=0.0) or float(np.max(np.linalg.norm(
             by_input, axis=0)))
-        by_output = np.linalg.pinv(H) * np.where(moved > _RANK * usual * sizes, moved,
+        by_output = pseudo_inverse(H) * np.where(moved > _RANK * usual * sizes, moved,
                                                  usual * sizes)
         candidates = [by_input] if model.n_u == len(H) else []
         for found in (*candidates, by_output):

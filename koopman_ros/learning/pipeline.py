@@ -16,7 +16,7 @@ import shutil
 import numpy as np
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.datasets import Episode
+from koopman_ros.core.datasets import Episode, sample_interval
 from koopman_ros.core.paths import backup_path
 from koopman_ros.core.progress import progress_line
 from koopman_ros.core.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
@@ -265,7 +265,8 @@ def _with_provenance(model: LiftedModel, found: Identified, decision: Acceptance
         for array in (episode.time, episode.x, episode.input_time, episode.u):
             sha.update(np.ascontiguousarray(array).astype('<f8').tobytes())
         sha.update(bytes(episode.linear))
-    metrics = {**model.provenance.metrics, 'coverage': covered}
+    metrics = {**model.provenance.metrics, 'coverage': covered,
+               'sample_interval': sample_interval(episodes) * model.seconds_per_time_unit}
     for label, values in (('rollout_rmse', decision.rmse), ('noise', decision.noise)):
         labels = [label] if len(values) == 1 else [
             f'{label}_{name}' for name in model.states.names]

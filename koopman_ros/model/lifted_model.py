@@ -13,7 +13,7 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
-from koopman_ros.core.arrays import Array, frozen, short_repr, show_printed
+from koopman_ros.core.arrays import Array, frozen, pseudo_inverse, short_repr, show_printed
 from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.integration import adaptive
 from koopman_ros.core.units import (
@@ -44,7 +44,8 @@ COMMANDED = 'commanded_'
 
 # Figures on held-out data in words, by their names in files.
 _FIGURES = {'cond': 'Condition number', 'rw': 'Held-out residual of the lift, relative',
-            'rx': 'Held-out residual of the drift, relative', 'coverage': 'Cells visited'}
+            'rx': 'Held-out residual of the drift, relative', 'coverage': 'Cells visited',
+            'sample_interval': 'Sample interval of the record [s]'}
 _FIGURES_OF_STATES = {'rollout_rmse': 'Held-out roll-out error (RMS)',
                       'noise': 'Measurement noise', 'free_run': 'Free-run error (RMS)'}
 _SAMPLES = 256  # random states of a box whose training states are not known
@@ -383,7 +384,7 @@ class LiftedModel:
         z, J = self.lift_and_jacobian(x)
         rate = (J @ (self.drift(x) + self.pre_feedback_rate(x))[..., None])[..., 0]
         rest = rate - z @ self.A.T
-        whitening = np.linalg.pinv(z.T @ z)
+        whitening = pseudo_inverse(z.T @ z)
         size = float(np.sum(rate @ whitening * rate))
         return float(np.sum(rest @ whitening * rest)) / size if size > 0.0 else 0.0
 
@@ -394,13 +395,13 @@ class LiftedModel:
 
     @cached_property
     def _nominal_inverse(self) -> Array:
-        return frozen(np.linalg.pinv(self.B), 'inverse of B', (self.n_u, self.n_x))
+        return frozen(pseudo_inverse(self.B), 'inverse of B', (self.n_u, self.n_x))
 
     def input_inverse(self, x: Array | None = None) -> Array:
         """Return the pseudo-inverse (n_u, n_x) of B(x) at a state (n_x,), or the nominal one."""
         if x is None or self.input_terms is None:
             return self._nominal_inverse
-        return np.asarray(np.linalg.pinv(self.input_matrix(x)), dtype=np.float64)
+        return pseudo_inverse(self.input_matrix(x))
 
     def input_matrix(self, x: Array) -> Array:
         """Evaluate B(x): (..., n_x) -> (..., n_x, n_u); one (n_x, n_u) where it is constant."""
@@ -490,7 +491,7 @@ class LiftedModel:
             # one state: a tenth of the time of a singular value decomposition
             row: Array = J.swapaxes(-1, -2)
             return row / (row @ J)
-        return np.asarray(np.linalg.pinv(J), dtype=np.float64)
+        return pseudo_inverse(J)
 
     @cached_property
     def _weights(self) -> Array | None:

@@ -3,7 +3,7 @@
 
 """The model file: arrays and a JSON description in the safetensors format, no code."""
 
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields
 import hashlib
 import json
 import math
@@ -46,6 +46,17 @@ _COORDINATES = ('names', 'units', 'center', 'scale', 'lower', 'upper')
 _MAX_REASON = 300  # characters of a rejection, which may quote the file
 
 Tensors = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Magnitudes:
+    """The largest sizes of a model's numbers; beyond them calculations overflow."""
+
+    #: of weights, matrices and training states in scaled deviations and the model's time unit;
+    #: trained models reach about 200, and one of a plant with time constants of microseconds 1e6
+    scaled: float = 1e9
+    #: of nominal points and ranges in the units of the signals; 1 over it for a scale
+    physical: float = 1e15
 
 
 class ModelFileError(ValueError):
@@ -134,6 +145,42 @@ def check(model: LiftedModel) -> None:
     if origin.model_class not in ('', *CLASSES):
         raise ValueError(f'model_class must be one of {", ".join(CLASSES)}, got '
                          f'{origin.model_class!r}')
+    _check_magnitudes(model)
+
+
+def _check_magnitudes(model: LiftedModel, most: Magnitudes = Magnitudes()) -> None:
+    """Raise a ValueError that names the signals of a number of impossible size, and the number."""
+    for signals in (model.states, model.inputs, model.disturbances):
+        curves = signals.characteristics
+        for what, values in (
+                *((name, getattr(signals, name)) for name in ('center', 'lower', 'upper',
+                                                              'scale')),
+                ('1 / scale', 1.0 / signals.scale),
+                ('characteristic', [max(np.abs(curves[name].values).max(),
+                                        np.abs(curves[name].effects).max())
+                                    if name in curves else 0.0 for name in signals.names])):
+            _check_size(what, np.asarray(values), (signals.names,), most.physical)
+    states, inputs = model.states.names, model.inputs.names
+    axes = {'W': (None, states), 'B': (states, inputs), 'E': (states, model.disturbances.names),
+            'readout': (states, None), 'pre_feedback': (inputs, states),
+            'input_terms': (None, states, inputs), 'training_states': (None, states),
+            'verified_loops.starts': (None, states), 'verified_loops.setpoints': (None, states)}
+    for name, array in _tensors(model).items():
+        _check_size(name, array, axes.get(name, (None,) * array.ndim), most.scaled)
+
+
+def _check_size(what: str, values: NDArray[Any], names: tuple[tuple[str, ...] | None, ...],
+                most: float) -> None:
+    """
+    Check the size of numbers.
+
+    :param names: of the signals along each axis, None for an axis without signals.
+    """
+    if values.size and not np.abs(values).max() <= most:
+        at = np.unravel_index(int(np.argmax(np.abs(values))), values.shape)
+        place = ', '.join(str(i) if axis is None else axis[i]
+                          for i, axis in zip(at, names, strict=True))
+        raise ValueError(f'{what}[{place}] is {values[at]:.6g}, allowed are -{most:g} to {most:g}')
 
 
 def _check_text(what: str, text: object, longest: int = _MAX_NAME) -> None:

@@ -38,7 +38,7 @@ class Timing:
         # time of the last measurement, if it was no news, by both clocks, and why
         self._ignored: tuple[float, int, Advance] | None = None
         self._spare = _JITTER  # s that the rate limit may count beyond those that have passed
-        self._counted = -math.inf  # s by the steady clock, when it counted some last
+        self._counted = -math.inf  # s by the clock of the stamps, when it counted some last
         self.age = math.nan  # s, of the last measurement at its arrival
         self.answer_seconds = math.nan  # from its arrival to its command
         self.busy = False  # whether messages since then wait for the node itself
@@ -86,12 +86,18 @@ class Timing:
         """
         Return how many of the seconds since the last stamp the rate limit may count, or None.
 
-        They are those of the steady clock, where stamps are of the time of the node's clock. Of
-        those that it does not count, one is kept, since messages come early and late.
+        They are those of the steady clock, where stamps are of the time of the node's clock, or of
+        /clock where the node follows it. Of those that it does not count, one is kept, since
+        messages come early and late.
         """
-        passed = max(0.0, at[0] - self._counted)
-        self._counted = max(self._counted, at[0])
-        if self._simulated or math.isnan(self._age(stamp_ns, at)):
+        known = not math.isnan(self._age(stamp_ns, at))
+        # /clock may be published less often than measurements
+        now = self._passing(at, stamp_ns if known else 0)
+        if now < self._counted - _JITTER:
+            self._counted = now  # /clock was set back
+        passed = max(0.0, now - self._counted)
+        self._counted = max(self._counted, now)
+        if not known:
             return None
         counted = max(0.0, min(seconds, passed + self._spare))
         self._spare = min(passed + self._spare - counted, _JITTER)
@@ -99,7 +105,11 @@ class Timing:
 
     def commanded(self) -> None:
         """Take down that a command without a measurement has counted the time until now."""
-        self._counted = time.monotonic()
+        self._counted = max(self._counted, self._passing(self.now()))
+
+    def _passing(self, at: tuple[float, int, int], stamp_ns: int = 0) -> float:
+        """Return the time in s by which the rate limit counts."""
+        return max(at[1], stamp_ns) / NANOSECONDS if self._simulated else at[0]
 
     def answered(self) -> None:
         """Take down that its command is out."""

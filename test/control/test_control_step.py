@@ -5,6 +5,7 @@
 
 from dataclasses import replace
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -184,6 +185,34 @@ def test_ramp_and_rate_limit_count_no_more_than_another_clock_allows(countable, 
         assert read(command, report) == pytest.approx(-RATE * seconds, abs=1e-6)
 
 
+@pytest.mark.parametrize('seconds', [1.5, 1.0 * SECOND, np.float64(1.0), '1'])
+def test_a_time_is_an_integer_of_nanoseconds(seconds):
+    loop, state = controller(), started()
+    for give in (lambda: loop.step(state, np.array([START]), seconds),
+                 lambda: loop.hold(state, seconds), lambda: loop.request_setpoint(
+                     state, np.array([START]), seconds)):
+        with pytest.raises(TypeError, match='integer of nanoseconds'):
+            give()
+    assert loop.step(state, np.array([START]), np.int64(NOW + SECOND))[0].time_ns == NOW + SECOND
+
+
+@pytest.mark.parametrize(('recorded', 'nanoseconds', 'warned'), [
+    (5.0, 5 * SECOND, False), (5.0, SECOND // 10, False), (5.0, 5, True), (5.0, 5000, True),
+    (5.0, 5_000_000, True), (None, 60 * SECOND, False), (None, 60, True), (None, 60_000, True)])
+def test_measurements_much_closer_together_than_in_the_record_are_a_warning(
+        recorded, nanoseconds, warned):
+    model = shipped('reactor_nz4')
+    model = replace(model, provenance=replace(model.provenance, metrics={} if recorded is None else
+                                              {'sample_interval': recorded}))
+    loop, state = Controller(model, Tuning.for_model(model)), State()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter('always')
+        for k in range(5):
+            state = loop.step(state, np.array([START]), k * nanoseconds)[0]
+    # once, not with each measurement
+    assert ['nanoseconds' in str(one.message) for one in caught] == [True] * warned
+
+
 # Without measurements.
 
 def test_a_setpoint_is_acted_on_from_the_estimate_while_nothing_is_measured():
@@ -232,6 +261,38 @@ def test_a_manual_command_moves_at_the_rate_limit_without_measurements():
         # at most a second counts for the first one
         assert abs(commands[1] - 300.0) <= RATE + 1e-9
         assert np.max(np.abs(np.diff(commands[1:]))) <= 0.5 * RATE + 1e-9
+
+
+@pytest.mark.parametrize('interval', [1, 5])
+@pytest.mark.parametrize('held', [False, True])
+def test_seconds_of_commands_in_a_silence_do_not_count_again(interval, held):
+    loop = controller()
+    state = started(loop)
+    for k in range(1, 4):
+        state = measured(loop, state, START, interval * k)[0]
+    at = interval * 3
+    state = loop.request_setpoint(state, np.array([305.0]))[0]
+    first = state.command[0]
+    for second in range(1, 11):
+        state = loop.hold(state, NOW + (at + second) * SECOND, None)[0]
+    # the law would go on, and measurements come late all at once
+    assert first - state.command[0] == pytest.approx(10.0 * RATE)
+    if held:
+        state = loop.hold(state, NOW + round((at + 10.1) * SECOND))[0]
+    for second in (8, 9, 9.5, 10, 11, 11.5):
+        state, command, _ = measured(loop, state, START, at + second)
+        assert first - command[0] == pytest.approx(max(10.0, second) * RATE)
+
+
+def test_a_hold_leaves_its_seconds_to_the_next_command():
+    loop = controller()
+    state = measured(loop, started(loop), START, 5)[0]
+    state = loop.request_setpoint(state, np.array([305.0]))[0]
+    for second in range(6, 20):
+        state = loop.hold(state, NOW + second * SECOND)[0]
+    # of a clock that runs slower than that of the silence
+    state, command, _ = measured(loop, state, START, 10)
+    assert command[0] == pytest.approx(300.0 - 5.0 * RATE)
 
 
 # Set-points.

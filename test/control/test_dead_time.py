@@ -110,6 +110,19 @@ def test_a_prediction_that_diverges_is_a_failure_of_the_level():
     np.testing.assert_array_equal(command, state.command)
 
 
+@pytest.mark.parametrize(('rate', 'acts'), [(8.0, True), (2e298, False)])
+def test_a_mode_too_fast_to_predict_over_the_dead_time_is_a_failure_of_the_level(rate, acts):
+    model = linearised_model(np.array([[-rate]]), np.array([[rate]]), *(
+        Coordinates((name,), ('m',), np.zeros(1), np.ones(1), -np.ones(1), np.ones(1))
+        for name in 'xu'), 's', Provenance(plant=''))
+    loop = Controller(replace(model, dead_time=np.array([100.0])), Tuning.for_model(model))
+    state = loop.initialise(State(), np.zeros(1))
+    report = loop.step(state, np.array([0.1]), SECOND)[2]
+    assert report.level == ('sdre' if acts else 'hold')
+    if not acts:
+        assert report.reason.cause.code is StatusCode.NOT_PREDICTED
+
+
 @pytest.mark.parametrize(('known', 'given', 'bandwidth'), [
     (0.0, {}, 0.1), (5.0, {}, 0.1), (40.0, {}, 0.023), (40.0, {'dead_time': 0.0}, 0.1),
     (0.0, {'dead_time': 80.0}, 0.013), (40.0, {'dead_time': -1.0}, 0.023),

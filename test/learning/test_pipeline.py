@@ -99,6 +99,7 @@ def test_accepted_lift_is_written_and_the_one_before_is_kept(accepted):
     assert {('temperature', 'coolant_temperature'): origin.metrics['coverage']} == (
         retrained.coverage)
     assert 0.2 < origin.metrics['coverage'] < 1.0
+    assert origin.metrics['sample_interval'] == pytest.approx(1.0)
     # over the middle of the box, where twenty minutes tell enough
     x, u = np.linspace(310.0, 322.0, 25)[:, None], np.full((25, 1), 288.0)
     rate = model.states.scale * (model.drift(model.states.to_deviation(x))

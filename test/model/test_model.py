@@ -531,3 +531,11 @@ def test_lists_do_as_arrays_do_and_another_size_is_rejected():
     plant = replace(model.plant, nominal_state=[1.0, 1.0])
     with pytest.raises(ValueError, match='incompatible x: expected one row'):
         Box.of(plant, [1.0, 2.0], [[1.0]])
+
+
+def test_the_mismatch_of_a_lift_that_overflows_at_a_training_state_is_an_error():
+    # LAPACK's decomposition of a matrix with infinities does not return
+    model = random_lift()
+    far = replace(model, training_states=TrainingStates(np.array([[1e200, 0.0], [0.0, 0.1]]), 0.1))
+    with np.errstate(all='ignore'), pytest.raises(np.linalg.LinAlgError, match='not finite'):
+        assert far.mismatch

@@ -60,7 +60,7 @@ MODELS = {
     'monomials': replace(PLAIN, observables=PolynomialObservables.total_degree(2, 2),
                          readout=RNG.normal(size=(2, 5))),
     'extreme': replace(PLAIN, A=np.diag(
-        [5e-324, -0.0, np.finfo(float).max, np.pi, -np.finfo(float).tiny])),
+        [5e-324, -0.0, 1e9, np.pi, -np.finfo(float).tiny])),
     'other alphabets': replace(
         with_origin(plant='R\xfchrkessel \u53cd\u5fdc', method='m' * 200, seed=2 ** 128 - 1),
         states=replace(PLAIN.states, units=('\N{DEGREE SIGN}C', 'K'))),
@@ -191,6 +191,10 @@ DESCRIPTIONS: list[tuple[str, dict[str, Any], str]] = [
     *(('states', {'center': center}, '') for center in (
         [None, 1.0], [INFINITE, 1], [[1], [1, 2]], {'x': 1}, [HUGE, 1], [[1, 2], [3, 4]])),
     ('states', {'scale': [0.0, 1.0]}, 'scale must be positive'),
+    ('states', {'scale': [1.0, 1e-300]}, '1 / scale[x1] is 1e+300, allowed are'),
+    ('states', {'center': [1.0, -1e200]}, 'center[x1] is -1e+200, allowed are'),
+    ('inputs', {'upper': [1e300]}, 'upper[u0] is 1e+300, allowed are'),
+    ('inputs', {'characteristics': {'u0': [[0.0, 1e300], [0.0, 1e300]]}}, 'characteristic[u0] is'),
     ('inputs', {'lower': [4.0]}, 'the box is empty'),
     ('states', {'names': ['x\ud800', 'x1']}, 'unprintable'),
     ('states', {'units': ['K', 'K\n']}, 'unprintable'),
@@ -212,11 +216,26 @@ DESCRIPTIONS: list[tuple[str, dict[str, Any], str]] = [
         ({'accepted': 'yes'}, 'accepted must be a bool'), ({'accepted': False}, 'reasons'),
         ({'reasons': ['too large']}, 'reasons'), ({'accepted': False, 'reasons': 'x'}, 'list'),
         ({'accepted': False, 'reasons': ['a\nb']}, 'unprintable')))]
+
+
+def with_one(values, number):
+    changed = values.copy()
+    changed[1, min(1, values.shape[1] - 1)] = number
+    return changed
+
+
 ARRAYS: list[tuple[str, dict[str, Any], str]] = [
     *(('network', {name: np.full_like(value, number)}, 'must be finite')
       for number in (np.nan, np.inf)
       for name, value in (('A', PLAIN.A), ('B', PLAIN.B), ('W', PLAIN.observables.W),
                           ('b', PLAIN.observables.b), ('V', PLAIN.observables.V))),
+    *((name, {array: with_one(value, 1e9 * (1.0 + 1e-9))}, f'{place}] is 1e+09')
+      for name, array, value, place in (
+          ('network', 'W', PLAIN.observables.W, 'W[1, x1'), ('network', 'A', PLAIN.A, 'A[1, 1'),
+          ('read-out', 'readout', MODELS['read-out'].readout, 'readout[x1, 1'),
+          ('training states', 'training_states', MODELS['training states'].training_states.states,
+           'training_states[1, x1'))),
+    ('network', {'B': with_one(PLAIN.B, -1e300)}, 'B[x1, u0] is -1e+300, allowed are -1e+09 to'),
     ('network', {'A': PLAIN.A.astype(np.float32)}, 'has type float32'),
     ('network', {'A': PLAIN.A.ravel()}, 'incompatible A'),
     ('network', {'B': PLAIN.B.T}, 'incompatible B'),

@@ -89,7 +89,6 @@ def test_seconds_count_as_far_as_they_have_passed_and_one_more(
 def test_paused_simulation_is_no_silence(monkeypatch: pytest.MonkeyPatch) -> None:
     clocks = Clocks(monkeypatch, simulated=True)
     timing = Timing(clocks.node)
-    assert timing.countable(1.0, 0, timing.now()) is None
     for _ in range(3):
         clocks.pass_by(20.0, 1.0)
         measured(timing, clocks.simulated)
@@ -103,3 +102,28 @@ def test_paused_simulation_is_no_silence(monkeypatch: pytest.MonkeyPatch) -> Non
     clocks.pass_by(1.0, 12.0)
     assert (timing.silence, timing.paused) == (12.0, False)
     assert math.isfinite(timing.age)
+
+
+def test_seconds_count_once_on_a_simulated_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    clocks = Clocks(monkeypatch, simulated=True)
+    timing = Timing(clocks.node)
+    clocks.pass_by(0.1, 1000.0)
+
+    def counted(stamp: float, seconds: float) -> float | None:
+        return timing.countable(seconds, round(stamp * SECOND), timing.now())
+
+    assert counted(1000.0, 1.0) == 1.0
+    # before /clock, which is published every ten seconds
+    assert [counted(1000.0 + k, 1.0) for k in range(1, 11)] == [1.0] * 10
+    clocks.pass_by(0.1, 10.0)
+    assert counted(1011.0, 1.0) == 1.0
+    # the watchdog has commanded until 1020 s, then all that was under way comes at once
+    clocks.pass_by(0.1, 10.0)
+    timing.commanded()
+    late = [counted(1011.0 + k, 1.0) for k in range(1, 10)]
+    assert sum(late) == pytest.approx(1.0)
+    # a simulation that begins again
+    clocks.pass_by(0.1, -1000.0)
+    assert counted(20.5, 1.0) is not None
+    clocks.pass_by(0.1, 1.0)
+    assert counted(21.5, 1.0) == 1.0

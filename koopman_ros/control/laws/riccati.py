@@ -18,7 +18,7 @@ from koopman_ros.control.laws.base import (
     Target,
     Weights,
 )
-from koopman_ros.core.arrays import Array
+from koopman_ros.core.arrays import Array, pseudo_inverse
 from koopman_ros.core.solvers import (
     RiccatiSolution,
     solve_riccati,
@@ -124,7 +124,7 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights,
         A[:, :n_x] += H
         Q[:n_x, :n_x] = weights.Q
     else:
-        C = np.linalg.pinv(M)
+        C = pseudo_inverse(M)
         A, Q = model.A + H @ C, C.T @ weights.Q @ C
     riccati = solve_riccati(A, J.dot(B), Q, weights.R, **how)
     # N(x) - N(x_ref) = M e

@@ -805,12 +805,14 @@ static mat feed_forward(const koopman_state *s) {
 }
 
 /* Predict an estimate from one time to another; returns 0 where it is lost. For a law, pieces
- * shorter than a share of the fastest time constant act by their mean, and the covariance stays;
- * inputs with a dead time up to `acts` are held. */
+ * shorter than a share of the fastest time constant act by their mean, the covariance stays, and no
+ * more than 1,000 of these time constants are predicted; inputs with a dead time up to `acts` are
+ * held. */
 static int over_pieces(const koopman_state *s, int linear, int64_t begin, int64_t end,
                        double share, int64_t acts, mat held, koopman_estimate *e) {
     double time = 0.0, u[NU];
     mat sum = zeros(NU, 1);
+    if (share > 0.0 && (double)(end - begin) / SECOND * FASTEST_RATE > 1000.0) return 0;
     for (int64_t next; begin < end; begin = next) {
         next = piece(s, begin, end, u);
         double seconds = (double)(next - begin) / SECOND, count;
