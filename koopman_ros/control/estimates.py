@@ -168,14 +168,20 @@ class StateEstimation:
                 # the model hardly predicts its motion; under the safe input even a
                 # plant that it does not expect to may rest there
                 return np.zeros_like(y)
-            moved = self.predict(state._replace(estimate=replace(before, w=then.w)), time)
+            assert last is not None
+            # from where the model has come to, which it may settle at
+            states = self.model.states
+            x = states.to_deviation(self.outputs.state(
+                last.value + then.travel, states.to_physical(before.x)))
+            moved = self.predict(state._replace(estimate=replace(before, x=x, w=then.w)), time)
             assert moved is not None
-            return self.outputs.of((moved.x - before.x) * self.model.states.scale)
+            return self.outputs.of((moved.x - x) * states.scale)
 
         bad = [name for name, level in zip(self.outputs.names, quality or (), strict=False)
                if level > UNCERTAIN]
         verdict = Verdict(last, reason(StatusCode.BAD_QUALITY, signal=bad[0])) if bad else check(
-            self.tuning.sensor, self.outputs, last, y, time.now_ns, w, travel)
+            self.tuning.sensor, self.outputs, last, y, time.now_ns, w, travel,
+            max(self.dead_ns, default=0))
         expected = None if predicted is None else self.outputs.of(
             self.model.states.to_physical(predicted.x))
         if verdict.fault is None:
@@ -199,7 +205,11 @@ class StateEstimation:
                 and last is not None):
             # the estimate from a frozen sensor is no disturbance
             predicted, history = replace(predicted, w=last.standstill.w), History()
-        now = state._replace(accepted=verdict.accepted, time_ns=time.now_ns, estimate=predicted,
+        accepted = verdict.accepted
+        if before is None and predicted is not None and accepted is not None:
+            # what holds the plant at first is no motion
+            accepted = replace(accepted, standstill=replace(accepted.standstill, w=predicted.w))
+        now = state._replace(accepted=accepted, time_ns=time.now_ns, estimate=predicted,
                       history=history)
         return self._remembering(
             now, state, time, x_measured if verdict.fault is None else None, quality

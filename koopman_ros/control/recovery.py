@@ -42,20 +42,22 @@ class SafeStateRecovery:
     since_ns: int  #: from when it has rested
     led: bool = False  #: whether the input has begun to move
 
-    def moved(self, outside: float, time_ns: int, recovery_time: float
+    def moved(self, outside: float, time_ns: int, recovery_time: float, dead_time: float
               ) -> SafeStateRecovery | None:
         """
         Take a distance in half-ranges into account; None where the safe input led it back.
 
         A plant that still moves under the safe input is waited for; one that moves further out
-        than where the way began starts it again.
+        than where the way began starts it again. Whether it moves is not seen before the input
+        acts, after a dead time in s, which may be twice as long as known.
         """
         if not (outside > 0.0 or self.led):
             return None
         change, still = outside - self.farthest, _MOVED * (1.0 + self.farthest)
         if change > still or (change < -still and not self.led):
             return SafeStateRecovery(outside, outside, time_ns)
-        led = self.led or (time_ns - self.since_ns) / NANOSECONDS >= _REST * recovery_time
+        led = self.led or (time_ns - self.since_ns) / NANOSECONDS >= (
+            _REST * recovery_time + 2.0 * dead_time)
         return SafeStateRecovery(self.farthest, min(self.nearest, outside), self.since_ns, led)
 
     @property

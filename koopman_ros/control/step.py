@@ -49,7 +49,7 @@ from koopman_ros.core.arrays import all_finite, Array, read_only
 from koopman_ros.core.plugins import contained
 from koopman_ros.core.signals import numbers
 from koopman_ros.core.status import Reason, reason, StatusCode
-from koopman_ros.core.units import LATE_NANOSECONDS, nanoseconds
+from koopman_ros.core.units import LATE_NANOSECONDS, NANOSECONDS, nanoseconds
 from koopman_ros.estimation import Estimate, History, Verdict
 
 
@@ -295,7 +295,8 @@ class ControlStep(Configuration):
                 self.safe_input, self.nominal_input):
             return None
         if state.recovery is not None:
-            return state.recovery.moved(outside, time_ns, self.order.recovery_time)
+            return state.recovery.moved(outside, time_ns, self.order.recovery_time,
+                                        max(self.estimation.dead_ns, default=0) / NANOSECONDS)
         # where laws failed, or one may act soon, it is not the distance that keeps them off
         kept_out = supervisor.bad_since_ns is None and supervisor.better_since_ns is None
         return SafeStateRecovery(outside, outside, time_ns) if kept_out and outside > 0.0 else None

@@ -110,6 +110,42 @@ def test_a_prediction_that_diverges_is_a_failure_of_the_level():
     np.testing.assert_array_equal(command, state.command)
 
 
+def quantised(step, stuck_from=math.inf):
+    """Return a sensor with a resolution, which is stuck from a time in s on."""
+    kept = []
+
+    def read(value, second):
+        if second >= stuck_from and kept:
+            return kept[0]
+        kept[:] = [np.round(value / step) * step]
+        return kept[0]
+
+    return read
+
+
+@pytest.mark.parametrize(('share', 'plant', 'start'), [
+    (1.0, FOULED, 10.0), (1.3, FOULED, 400.0), (1.3, REACTOR, 10.0)])
+def test_no_sensor_is_called_stuck_before_an_effect_can_be_seen(share, plant, start):
+    loop, process, state = late_reactor(60.0 * share, 60.0, plant)
+    loop = replace(loop, tuning=replace(loop.tuning, sensor=replace(
+        loop.tuning.sensor, jump=np.array([0.5]), stuck_sensor_timeout=20.0)))
+    run = simulate(loop, process, [at(start, SetpointRequest(0, np.array([SETPOINT])))],
+                   duration=start + 400.0, period=2.0, state=state, sensor=quantised(0.5))
+    assert {report.level for report in run.reports} == {'sdre'}
+
+
+def test_a_stuck_sensor_behind_a_dead_time_is_found():
+    loop, process, state = late_reactor(60.0, stuck_sensor_timeout=20.0)
+    loop = replace(loop, tuning=replace(loop.tuning, sensor=replace(
+        loop.tuning.sensor, stuck_sensor_timeout=20.0)))
+    run = simulate(loop, process, [at(10.0, SetpointRequest(0, np.array([SETPOINT])))],
+                   duration=260.0, period=2.0, state=state, sensor=quantised(0.1, 40.0))
+    held = [2.0 * k for k, report in enumerate(run.reports) if report.level == 'hold']
+    # the coolant acts from 70 s on, and two dead times more are waited for
+    assert 190.0 < held[0] < 220.0
+    assert run.reports[int(held[0] / 2.0)].reason.code is StatusCode.FROZEN
+
+
 @pytest.mark.parametrize(('rate', 'acts'), [(8.0, True), (2e298, False)])
 def test_a_mode_too_fast_to_predict_over_the_dead_time_is_a_failure_of_the_level(rate, acts):
     model = linearised_model(np.array([[-rate]]), np.array([[rate]]), *(

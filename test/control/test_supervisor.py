@@ -330,21 +330,24 @@ def test_it_leads_back_from_either_side(side):
 def test_the_input_is_ahead_of_the_plant_by_the_lead():
     way = SafeStateRecovery(2.0, 2.0, 0)
     assert way.share == 0.0
-    assert way.moved(2.0, 29 * SECOND, 10.0).share == 0.0
-    led = way.moved(2.0, 30 * SECOND, 10.0)
+    assert way.moved(2.0, 29 * SECOND, 10.0, 0.0).share == 0.0
+    led = way.moved(2.0, 30 * SECOND, 10.0, 0.0)
+    # behind a dead time of 40 s, or twice that, the safe input may not have acted
+    assert not way.moved(2.0, 109 * SECOND, 10.0, 40.0).led
+    assert way.moved(2.0, 110 * SECOND, 10.0, 40.0).led
     assert led.share == LEAD
-    half = led.moved(1.0, 31 * SECOND, 10.0)
+    half = led.moved(1.0, 31 * SECOND, 10.0, 0.0)
     assert half.share == pytest.approx(LEAD + 0.5)
     # what has been reached is not given up for noise, but the way starts anew further out
-    assert half.moved(1.5, 32 * SECOND, 10.0) == half
-    assert half.moved(0.0, 33 * SECOND, 10.0).share == 1.0
-    assert half.moved(2.2, 34 * SECOND, 10.0) == SafeStateRecovery(2.2, 2.2, 34 * SECOND)
+    assert half.moved(1.5, 32 * SECOND, 10.0, 0.0) == half
+    assert half.moved(0.0, 33 * SECOND, 10.0, 0.0).share == 1.0
+    assert half.moved(2.2, 34 * SECOND, 10.0, 0.0) == SafeStateRecovery(2.2, 2.2, 34 * SECOND)
 
 
 def test_recovery_waits_for_a_plant_that_returns_unaided():
     way = SafeStateRecovery(2.0, 2.0, 0)
     for second in range(1, 60):
-        way = way.moved(2.0 - 0.02 * second, second * SECOND, 10.0)
+        way = way.moved(2.0 - 0.02 * second, second * SECOND, 10.0, 0.0)
         assert way.share == 0.0
 
 

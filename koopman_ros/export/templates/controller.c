@@ -805,9 +805,8 @@ static mat feed_forward(const koopman_state *s) {
 }
 
 /* Predict an estimate from one time to another; returns 0 where it is lost. For a law, pieces
- * shorter than a share of the fastest time constant act by their mean, the covariance stays, and no
- * more than 1,000 of these time constants are predicted; inputs with a dead time up to `acts` are
- * held. */
+ * shorter than a share of the fastest time constant act by their mean, the covariance stays, and at
+ * most 1,000 of these time constants are predicted; inputs with a dead time up to `acts` are held. */
 static int over_pieces(const koopman_state *s, int linear, int64_t begin, int64_t end,
                        double share, int64_t acts, mat held, koopman_estimate *e) {
     double time = 0.0, u[NU];
@@ -891,17 +890,26 @@ static int check(const koopman_state *before, koopman_state *s, const double *y,
         store(of(NX, 1, moves.known ? moves.w : NULL), s->still_w);
     } else if (!(outside > 0.0) && !before->recovering && moves.known) {
         /* elsewhere the model's motion is worth little */
+        double place[NY];
+        mat x;
+        EACH(i, NY) place[i] = before->accepted[i] + before->travel[i];
+        x = deviation(OF_X, position(&moves, place).a);
+        store(x, moves.x);
         store(of(NX, 1, before->still_w), moves.w);
         predict(before, elapsed, &moves);
-        EACH(i, NX) moves.x[i] = (moves.x[i] - before->estimate.x[i]) * STATES_SCALE[i];
+        EACH(i, NX) moves.x[i] = (moves.x[i] - x.a[i]) * STATES_SCALE[i];
         travel = mul(of(NY, NX, OUTPUTS), of(NX, 1, moves.x));
     }
     EACH(i, NY) {
-        int stays = still && change[i] == 0.0;
+        int stays = still && change[i] == 0.0, seen;
+        double step = first ? 0.0 : change[i], least = s->resolution[i];
         if (!stays) s->still_since[i] = s->now;
         s->travel[i] = stays ? s->travel[i] + travel.a[i] : 0.0;
-        stuck = stuck || (fabs(s->travel[i]) > 0.5 * SENSOR_JUMP[i] && timeout > 0.0
-                          && since(s, s->still_since[i]) > timeout);
+        s->resolution[i] = step > 0.0 && (step < least || least == 0.0) ? step : least;
+        seen = stays && fabs(s->travel[i]) > larger(0.5 * SENSOR_JUMP[i], 4.0 * s->resolution[i]);
+        if (!seen) s->seen_since[i] = s->now;
+        stuck = stuck || (seen && s->now - s->seen_since[i] >= 2 * LONGEST_DEAD_TIME
+                          && timeout > 0.0 && since(s, s->still_since[i]) > timeout);
     }
     return stuck ? KOOPMAN_FROZEN : KOOPMAN_OK;
 }
@@ -957,6 +965,7 @@ static int observe(koopman_state *s, const double *y, double elapsed, double *ou
         if (s->commanded) piece(s, s->now, s->now, held);
         u = input_deviation(held);
         restart(linear, e, x, s->commanded ? &u : NULL, feed_forward(s));
+        store(of(NX, 1, e->w), s->still_w);     /* what holds the plant at first is no motion */
     } else if (moved || !(elapsed > 0.0) || (*outside > MARGIN[LAWS - 1] && far(y))
                || (silent * OBSERVER_BANDWIDTH > 2.0 && silent > 1.5 * s->interval)) {
         restart(linear, e, x, NULL, x);
@@ -1051,7 +1060,8 @@ static void recover(koopman_state *s, int fault, double outside) {
     if (was) {
         double change = outside - s->farthest, still = 0.03 * (1.0 + s->farthest);
         if (!(change > still || (change < -still && !s->led))) {
-            s->led = s->led || since(s, s->resting_since) >= 3.0 * TUNING_RECOVERY_TIME;
+            s->led = s->led || since(s, s->resting_since)
+                >= 3.0 * TUNING_RECOVERY_TIME + 2.0 * LONGEST_DEAD_TIME / SECOND;
             s->nearest = smaller(s->nearest, outside);
             return;
         }

@@ -61,11 +61,11 @@ typedef struct {
     int64_t applied_at[KOOPMAN_QUEUE];
     double applied[KOOPMAN_QUEUE][KOOPMAN_NU];
     double requested[KOOPMAN_NC], setpoint[KOOPMAN_NC], ramped[KOOPMAN_NC];
-    int64_t accepted_at, still_since[KOOPMAN_NY];
+    int64_t accepted_at, still_since[KOOPMAN_NY], seen_since[KOOPMAN_NY];
     int unmeasured[KOOPMAN_ND];
     int64_t disturbed_at[KOOPMAN_ND];
     double disturbance[KOOPMAN_ND];
-    double accepted[KOOPMAN_NY], travel[KOOPMAN_NY], still_w[KOOPMAN_NX];
+    double accepted[KOOPMAN_NY], travel[KOOPMAN_NY], resolution[KOOPMAN_NY], still_w[KOOPMAN_NX];
     koopman_estimate estimate;
     koopman_supervisor supervisor;
     int recovering, led;
