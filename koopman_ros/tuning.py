@@ -130,7 +130,8 @@ class Tuning:
             'empty: chosen automatically.', code=True)
     observer_bandwidth: float = parameter(
         0.0, 'Bandwidth of the disturbance observer. Higher removes offsets sooner and passes '
-        'more noise to the inputs. 0: no observer.', '1/s', 0.0, 1000.0)
+        'more noise to the inputs. 0: no observer. Kalman filters: see disturbance_noise.', '1/s',
+        0.0, 1000.0)
     max_disturbance: Array = column(
         'inputs', 0.0, 'Bound of the estimated disturbance, as an equivalent change of this '
                        'input; 0: none.', none=ANY)
@@ -213,7 +214,9 @@ class Tuning:
         :raises ValueError: naming the mismatch.
         """
         states, inputs = model.states.names, model.inputs.names
-        every = tuple(name for i, name in enumerate(states) if i not in model.lagged.values())
+        every = tuple(name for i, name in enumerate(states) if (
+            name in measured and i not in model.lagged.values())) or tuple(
+                states[i] for i in model.measured)
         controlled = tuple(filter(None, self.controlled)) or every
         if list(controlled) != [name for name in states if name in controlled]:
             raise ValueError(f'controlled must be some of the states {", ".join(states)}, each '
@@ -249,11 +252,11 @@ class Tuning:
         """
         Return a tuning with weights, ranges and safe inputs of a model, except the given ones.
 
-        The weights are 1 on deviations scaled by the model, but 0 on applied inputs behind a lag,
+        The weights are 1 on deviations scaled by the model, but 0 on states that are not measured,
         the inputs' limits their trained range, and the safe inputs the nominal ones.
         """
-        inputs, weights = model.inputs, 1.0 / model.states.scale ** 2
-        weights[list(model.lagged.values())] = 0.0
+        inputs, weights = model.inputs, np.zeros(model.n_x)
+        weights[model.measured] = 1.0 / model.states.scale[model.measured] ** 2
         return cls(**{
             'state_weight': weights,
             'input_weight': 1.0 / inputs.scale ** 2,

@@ -30,7 +30,7 @@ class Configuration:
 
     model: LiftedModel  #: the lift
     tuning: Tuning  #: with one number for each signal
-    #: measured outputs; by default every state but the applied inputs behind a lag
+    #: measured outputs; by default the states that were measured in the model's training record
     outputs: Outputs | None = None
 
     __repr__ = short_repr
@@ -45,8 +45,7 @@ class Configuration:
     @cached_property
     def measured(self) -> Outputs:
         """The measured outputs: y = C x."""
-        states, applied = self.model.states, self.model.lagged.values()
-        rows = [i for i in range(len(states)) if i not in applied]
+        states, rows = self.model.states, self.model.measured
         own = states.only([states.names[i] for i in rows])
         return self.outputs or Outputs(own.names, own.units, np.eye(len(states))[rows])
 

@@ -84,7 +84,9 @@ class ControlStep(Configuration):
         :raises TypeError: for a time that is not an integer.
         :raises ValueError: for a measurement or an input of another size.
         """
-        y, time_ns = numbers('measurement', y, self.measured.names), nanoseconds(time_ns)
+        y = numbers('measurement', y, self.measured.names,
+                    'pass outputs= to the controller if other signals are measured')
+        time_ns = nanoseconds(time_ns)
         if applied is not None:
             applied = numbers('applied input', applied, self.model.inputs.names)
         if disturbances is not None and (signals := self.model.disturbances.names):

@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike
 from koopman_ros.core.arrays import Array, frozen
 
 
-def numbers(name: str, value: ArrayLike, signals: Sequence[str]) -> Array:
+def numbers(name: str, value: ArrayLike, signals: Sequence[str], remedy: str = '') -> Array:
     """Return one number for each of some signals (n,) as an array; ValueError for another size."""
     array = np.asarray(value, dtype=np.float64)
     if array.shape != (len(signals),):
-        raise _wrong_size(name, array, signals)
+        raise _wrong_size(name, array, signals, remedy)
     return array
 
 
@@ -33,9 +33,13 @@ def per_signal(name: str, value: Array, signals: Sequence[str]) -> None:
         raise ValueError(f'{name} must be numbers, got {value.tolist()}')
 
 
-def _wrong_size(name: str, value: ArrayLike, signals: Sequence[str]) -> ValueError:
-    return ValueError(f'incompatible {name}: expected one number for each of '
-                      f'{", ".join(signals)}, got {np.asarray(value).tolist()}')
+def _wrong_size(name: str, value: ArrayLike, signals: Sequence[str], remedy: str = ''
+                ) -> ValueError:
+    array = np.asarray(value)
+    return ValueError(
+        f'incompatible {name}: expected one number for each of {", ".join(signals)}, got '
+        f'{array.tolist()}, {array.size} in place of {len(signals)}'
+        + f'; {remedy}' * bool(remedy))
 
 
 @dataclass(frozen=True)

@@ -275,10 +275,13 @@ def _with_provenance(model: LiftedModel, found: Identified, decision: Acceptance
                 for name, error in zip(run.names, run.rmse, strict=True)}
     # a rejected lift may diverge
     metrics = {name: value for name, value in metrics.items() if np.isfinite(value)}
-    return replace(model, verified_loops=decision.law_check.tried, provenance=replace(
+    measured = model.states.names[:len(model.states) - found.hidden] if found.hidden else ()
+    origin = replace(
         model.provenance, data_digest=sha.hexdigest(), metrics=metrics,
         method=f'{found.method}, {found.drift.form}', model_class=model_class,
-        accepted=decision.accepted, reasons=decision.reasons, closed_loops=decision.statement))
+        accepted=decision.accepted, reasons=decision.reasons, closed_loops=decision.statement)
+    return replace(model, verified_loops=decision.law_check.tried, states_measured=measured,
+                   provenance=origin)
 
 
 def _place(output: Path, accepted: bool) -> Path:

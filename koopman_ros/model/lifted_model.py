@@ -98,6 +98,9 @@ class LiftedModel:
     disturbances: Coordinates = NO_SIGNALS
     #: (n_x, n_d) effect of the disturbances on the rate, in scaled coordinates; None without any
     E: Array | None = None
+    #: names of the states that are measured, as in the training record; none for all but applied
+    #: inputs behind a lag
+    states_measured: tuple[str, ...] = ()
 
     __repr__ = short_repr
     _repr_pretty_ = show_printed
@@ -146,6 +149,11 @@ class LiftedModel:
             if not 0.0 <= seconds <= LONGEST_DEAD_TIME:
                 raise ValueError(f'the dead time of {name} must be 0 to {LONGEST_DEAD_TIME:g} s, '
                                  f'got {seconds:g} s')
+        if list(self.states_measured) != [name for name in self.states.names
+                                          if name in self.states_measured]:
+            raise ValueError('states_measured must be some of the states '
+                             f'{", ".join(self.states.names)}, each once and in this order, got '
+                             f'{", ".join(self.states_measured)}')
         if self.input_terms is not None and (
                 self.input_terms.coefficients.shape[1:] != self.B.shape):
             raise ValueError(f'incompatible input terms: expected {("any", *self.B.shape)}, got '
@@ -205,6 +213,13 @@ class LiftedModel:
                     NEURAL_DRIFT if self.readout is not None and self.n_z == self.n_x else
                     IDENTITY_LIFT)
         return f'{name}, n_z = {self.n_z}' if name in (IDENTITY_LIFT, FREE_LIFT) else name
+
+    @cached_property
+    def measured(self) -> list[int]:
+        """Indices of the states that are measured, unless a controller is told otherwise."""
+        return [i for i, name in enumerate(self.states.names) if (
+            name in self.states_measured if self.states_measured
+            else i not in self.lagged.values())]
 
     @cached_property
     def lagged(self) -> dict[int, int]:

@@ -201,6 +201,8 @@ def _description(model: LiftedModel) -> dict[str, Any]:
         del about['provenance']['closed_loops']
     if isinstance(model.observables, NetworkObservables):
         about['identity'] = model.observables.identity
+    if model.states_measured:
+        about['states_measured'] = list(model.states_measured)
     if model.dead_time.any():
         about['dead_time'] = model.dead_time.tolist()
     if len(model.disturbances):
@@ -314,7 +316,9 @@ def _model(about: dict[str, Any], tensors: Tensors) -> LiftedModel:
                            dtype=np.float64),
         disturbances=(_coordinates(about['disturbances']) if 'disturbances' in about
                       else NO_SIGNALS),
-        E=tensors.pop('E', None))
+        E=tensors.pop('E', None),
+        states_measured=tuple(_of_type(list, about, 'states_measured')
+                              if 'states_measured' in about else ()))
     if tensors:
         raise ValueError(f'it holds unknown arrays: {", ".join(sorted(tensors))}')
     return model

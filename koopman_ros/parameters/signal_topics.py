@@ -197,13 +197,13 @@ def signals_of(model: LiftedModel, controlled: tuple[str, ...] = (),
     Return the signals of a model.
 
     :param controlled: names of states; all that are measured by default.
-    :param measured: names of states, in any order; by default all but applied inputs behind a lag.
+    :param measured: names of states, in any order; by default those of the training record.
     """
     every, inputs, disturbances = (dict(zip(of.names, of.units, strict=True))
                                    for of in (model.states, model.inputs, model.disturbances))
     # in the order of the states, as the control step wants them
     states = {name: unit for i, (name, unit) in enumerate(every.items()) if (
-        name in measured if measured else i not in model.lagged.values())}
+        name in measured if measured else i in model.measured)}
     named = tuple(filter(None, controlled))
     own = tuple(name for name in states if name in named)
     return Signals(states, inputs, (named if len(own) < len(named) else own) or tuple(states),

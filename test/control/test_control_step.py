@@ -15,6 +15,8 @@ from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.setpoint import advance, HORIZON_NANOSECONDS, rejection, request, Setpoint
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS as SECOND
+from koopman_ros.export import c_code
+from koopman_ros.parameters.controller import built, table_of
 from support.closed_loops import content, COOLANT, say, SETPOINT, shipped, START
 
 NOW = 1_785_000_000 * SECOND
@@ -211,6 +213,28 @@ def test_measurements_much_closer_together_than_in_the_record_are_a_warning(
             state = loop.step(state, np.array([START]), k * nanoseconds)[0]
     # once, not with each measurement
     assert ['nanoseconds' in str(one.message) for one in caught] == [True] * warned
+
+
+def test_what_the_record_measured_is_measured_and_controlled_by_default():
+    model = replace(shipped('two_state'), states_measured=('temperature',))
+    loop = Controller(model, Tuning.for_model(model))
+    assert (loop.measured.names, loop.controlled.names) == (('temperature',),) * 2
+    assert loop.tuning.state_weight.tolist() == [0.0, 1.0 / model.states.scale[1] ** 2]
+    kelvin = float(model.states.center[1])
+    state, command, report = loop.step(State(), np.array([kelvin]), NOW)
+    assert report.level == 'sdre'
+    np.testing.assert_allclose(command, model.inputs.center, rtol=0, atol=0.1)
+    assert loop.request_setpoint(state, np.array([kelvin + 1.0]))[1] is None
+    with pytest.raises(ValueError, match=r'2 in place of 1; pass outputs='):
+        loop.step(state, np.array([0.8, kelvin]), NOW + SECOND)
+    # the node and the C export have the same default
+    node = built(table_of(model, {'system': ''}).snapshot({}), model)
+    assert (node.measured.names, node.controlled.names) == (('temperature',),) * 2
+    assert '#define KOOPMAN_NY 1' in c_code(loop, 1.0)['controller.h']
+    # other outputs can be given
+    every = Controller(model, Tuning.for_model(model), Controller(
+        shipped('two_state'), Tuning.for_model(model)).measured)
+    assert every.controlled.names == ('concentration', 'temperature')
 
 
 # Without measurements.

@@ -281,7 +281,7 @@ def test_a_signal_is_stuck_where_the_model_moves_by_more_than_noise_and_resoluti
     outputs, last = Outputs(('level',), ('m',), np.eye(1)), None
     for second, y in enumerate((0.0, step, 3 * step, *[2 * step] * 60)):
         verdict = check(limits, outputs, last, np.array([y]), second * SECOND, np.zeros(1),
-                        lambda _: np.array([gone if second == 10 else 0.0]), 15 * SECOND)
+                        lambda _, moves=second == 10: np.array([gone * moves]), 15 * SECOND)
         last = verdict.accepted
         assert last.resolution == pytest.approx([0.0 if second == 0 else step])
         # two dead times after the model has moved

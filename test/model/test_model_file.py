@@ -66,6 +66,7 @@ MODELS = {
         states=replace(PLAIN.states, units=('\N{DEGREE SIGN}C', 'K'))),
     'untrained': with_origin(seed=None, metrics={}),
     'dead time': replace(random_lift(n_u=2), dead_time=np.array([0.0, 12.3])),
+    'measured': replace(PLAIN, states_measured=('x1',)),
     'disturbances': random_lift(n_u=3).with_disturbances(('u2', 'u0')),
     'characteristic': replace(PLAIN, inputs=replace(PLAIN.inputs, characteristics={
         PLAIN.inputs.names[0]: Characteristic.of([-1.0, 0.1, 2.0], [0.0, 0.7, 1.0])})),
@@ -183,6 +184,8 @@ DESCRIPTIONS: list[tuple[str, dict[str, Any], str]] = [
         (3.0, 'dead_time must be a list'), ([1.0, 2.0], 'incompatible dead_time'),
         ([-0.1], 'dead time of u0 must be 0 to 3600 s'), ([9e4], 'got 90000 s'),
         ([INFINITE], 'dead_time must be finite'), ([None], ''))),
+    ('', {'states_measured': 'x0'}, 'states_measured must be a list'),
+    ('', {'states_measured': ['x1', 'x0']}, 'each once and in this order'),
     ('', {'disturbances': []}, ''), ('', {'disturbances': {}}, "'names' is missing"),
     ('', {'time_unit': 'h'}, 'time_unit'), ('', {'states': []}, ''), ('', {'provenance': 3}, ''),
     ('states', {'units': ['K']}, 'incompatible units'),

@@ -806,7 +806,8 @@ static mat feed_forward(const koopman_state *s) {
 
 /* Predict an estimate from one time to another; returns 0 where it is lost. For a law, pieces
  * shorter than a share of the fastest time constant act by their mean, the covariance stays, and at
- * most 1,000 of these time constants are predicted; inputs with a dead time up to `acts` are held. */
+ * most 1,000 of these time constants are predicted; inputs with a dead time up to `acts` are
+ * held. */
 static int over_pieces(const koopman_state *s, int linear, int64_t begin, int64_t end,
                        double share, int64_t acts, mat held, koopman_estimate *e) {
     double time = 0.0, u[NU];
@@ -908,7 +909,7 @@ static int check(const koopman_state *before, koopman_state *s, const double *y,
         s->resolution[i] = step > 0.0 && (step < least || least == 0.0) ? step : least;
         seen = stays && fabs(s->travel[i]) > larger(0.5 * SENSOR_JUMP[i], 4.0 * s->resolution[i]);
         if (!seen) s->seen_since[i] = s->now;
-        stuck = stuck || (seen && s->now - s->seen_since[i] >= 2 * LONGEST_DEAD_TIME
+        stuck = stuck || (seen && s->now - s->seen_since[i] - LONGEST_DEAD_TIME >= LONGEST_DEAD_TIME
                           && timeout > 0.0 && since(s, s->still_since[i]) > timeout);
     }
     return stuck ? KOOPMAN_FROZEN : KOOPMAN_OK;
