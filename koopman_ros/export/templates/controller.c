@@ -909,8 +909,8 @@ static int check(const koopman_state *before, koopman_state *s, const double *y,
         s->resolution[i] = step > 0.0 && (step < least || least == 0.0) ? step : least;
         seen = stays && fabs(s->travel[i]) > larger(0.5 * SENSOR_JUMP[i], 4.0 * s->resolution[i]);
         if (!seen) s->seen_since[i] = s->now;
-        stuck = stuck || (seen && s->now - s->seen_since[i] - LONGEST_DEAD_TIME >= LONGEST_DEAD_TIME
-                          && timeout > 0.0 && since(s, s->still_since[i]) > timeout);
+        if (!seen || s->now - s->seen_since[i] - LONGEST_DEAD_TIME < LONGEST_DEAD_TIME) continue;
+        stuck = stuck || (timeout > 0.0 && since(s, s->still_since[i]) > timeout);
     }
     return stuck ? KOOPMAN_FROZEN : KOOPMAN_OK;
 }
