@@ -29,10 +29,11 @@ def tuned(model: LiftedModel, outputs: Outputs | None = None, **changes: object)
     measured = outputs or Outputs(states.names, states.units, np.eye(model.n_x))
     reach = np.abs(measured.C) @ (20.0 * states.scale)
     middle = measured.of(states.center)
+    controlled = [name in measured.names or measured.names[0] == 'y0' for name in states.names]
     return Controller(model, replace(Tuning.for_model(
         model, state_weight=1.0 / states.scale ** 2, input_weight=n_u / inputs.scale ** 2,
         limits=InputLimits(inputs.lower - n_u, inputs.upper + n_u, 0.5 * n_u),
-        setpoint_ramp=0.1 * states.scale, max_disturbance=2.0 * inputs.scale,
+        setpoint_ramp=0.1 * states.scale[controlled], max_disturbance=2.0 * inputs.scale,
         sensor=SensorLimits(middle - reach, middle + reach, 0.1 * reach, 0.2 * reach, 5.0),
         observer_bandwidth=0.2, hold_timeout=5.0,
         bumpless_transfer_time=3.0), **changes), outputs)

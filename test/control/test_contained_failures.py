@@ -356,8 +356,8 @@ def test_the_covariance_stays_positive_definite_over_any_gap(kind, seconds):
 
 def test_a_recovery_that_has_come_to_the_training_data_by_itself_is_over():
     began = SafeStateRecovery(1.0, 1.0, 0)
-    assert began.moved(0.0, SECOND, 10.0) is None
-    led = SafeStateRecovery(1.0, 1.0, 0, led=True).moved(0.0, SECOND, 10.0)
+    assert began.moved(0.0, SECOND, 10.0, 0.0) is None
+    led = SafeStateRecovery(1.0, 1.0, 0, led=True).moved(0.0, SECOND, 10.0, 0.0)
     assert led.share == 1.0
 
 
