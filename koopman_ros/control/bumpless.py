@@ -10,20 +10,22 @@ import math
 
 import numpy as np
 
-from koopman_ros.core.arrays import Array, change_within
+from koopman_ros.core.arrays import Array, change_within, differ
 from koopman_ros.tuning import InputLimits
 
 # In input units; a smaller remainder is below the resolution of any actuator.
 _NEGLIGIBLE = 1e-9
 
 
-def limit(limits: InputLimits, wanted: Array, previous: Array | None, seconds: float
-          ) -> tuple[Array, bool, bool]:
+def limit(limits: InputLimits, scale: Array, wanted: Array, previous: Array | None,
+          seconds: float) -> tuple[Array, bool, bool]:
     """
     Bring a command within its range, and within its rate where a previous command is known.
 
     A previous command from outside the range, which was tightened since, is left at the rate.
 
+    :param scale: (n_u,) of the inputs; a limit is active if it changes the command by more than
+        rounding.
     :param wanted: (n_u,) the law's command.
     :param previous: (n_u,) command `seconds` ago, or None at the first.
     :return: the command (n_u,), and whether range and rate were active.
@@ -33,7 +35,7 @@ def limit(limits: InputLimits, wanted: Array, previous: Array | None, seconds: f
         reach = change_within(limits.rate, seconds)
         command = np.minimum(np.maximum(within, previous - reach), previous + reach)
     command.setflags(write=False)
-    return command, within.tolist() != wanted.tolist(), command.tolist() != within.tolist()
+    return command, differ(within, wanted, scale), differ(command, within, scale)
 
 
 @dataclass(frozen=True, slots=True)

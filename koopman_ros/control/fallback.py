@@ -28,7 +28,7 @@ from koopman_ros.control.laws.base import (
     Target,
 )
 from koopman_ros.control.steady_state import partial_target, reachable_target
-from koopman_ros.core.arrays import all_finite, Array
+from koopman_ros.core.arrays import all_finite, Array, differ
 from koopman_ros.core.plugins import contained, plug_in
 from koopman_ros.core.signals import numbers, Outputs
 from koopman_ros.core.status import Reason, reason, StatusCode
@@ -198,7 +198,7 @@ class FallbackLevel:
                 estimate, target, result.memory, seconds, held), estimate, seconds)
             if result.u is None:
                 return result
-            held = limit(self.limits, result.u, held, seconds)[0]
+            held = limit(self.limits, self.model.inputs.scale, result.u, held, seconds)[0]
             u[dead_ns == end] = result.u[dead_ns == end]
         return replace(first, u=u)
 
@@ -240,7 +240,7 @@ class FallbackLevel:
         if self.integrates and self.model.commanded and not self.law.model_free:
             u = self._moved(u, estimate, seconds)
         within = self.limits.within(u)
-        clipped = result.clipped or within.tolist() != u.tolist()
+        clipped = result.clipped or differ(within, u, self.model.inputs.scale)
         return LawResult(within, None, result.info, result.memory, result.plan, clipped,
                          result.passing)
 

@@ -236,7 +236,8 @@ class ControlStep(Configuration):
                 changes['target'] = read_only(np.concatenate((
                     self.model.states.to_physical(target.x),
                     self.model.inputs.to_physical(target.u))))
-        u, at_range, at_rate = limit(self.tuning.limits, wanted, state.command, time.counted)
+        u, at_range, at_rate = limit(
+            self.tuning.limits, self.model.inputs.scale, wanted, state.command, time.counted)
         done = done._replace(at_range=done.at_range or at_range, at_rate=at_rate,
                              outside=self.model.inputs.violation(u))
         applied = state.applied.followed_by(time.command_ns, u, self.estimation.dead_ns)

@@ -114,6 +114,17 @@ def pseudo_inverse(A: Array) -> Array:
     return np.asarray(np.linalg.pinv(A), dtype=np.float64)
 
 
+def differ(values: Array, others: Array, scale: Array, tolerance: float = 1e-9) -> bool:
+    """
+    Return whether any of some numbers (n,) differs from another by more than rounding.
+
+    :param scale: (n,) positive, in their units.
+    :param tolerance: of the scale: far above the rounding error of a control step, which depends
+        on the BLAS kernel, and below the resolution of any actuator.
+    """
+    return bool((np.abs(values - others) > tolerance * scale).any())
+
+
 def all_finite(vector: Array) -> bool:
     """Return whether all numbers (n,) are finite, for a few of them in a fifth of NumPy's time."""
     return all(map(math.isfinite, vector.tolist()))

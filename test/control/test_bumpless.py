@@ -39,11 +39,15 @@ from support.closed_loops import (
     # a range that was tightened is reached at the rate
     (8.0, 3.0, 0.1, 2.0, 7.8, False, True), (8.0, 9.0, 0.1, 2.0, 7.8, True, True),
     # no rate limit, at the first answer of all, too
-    (-1.0, 4.0, 1e-9, np.inf, 4.0, False, False), (-1.0, 4.0, 0.0, np.inf, 4.0, False, False)])
+    (-1.0, 4.0, 1e-9, np.inf, 4.0, False, False), (-1.0, 4.0, 0.0, np.inf, 4.0, False, False),
+    # a command that exceeds a limit by rounding alone was computed within it
+    (None, 5.0 + 1e-14, 0.0, 2.0, 5.0, False, False),
+    (1.0, 3.0 + 1e-14, 1.0, 2.0, 3.0, False, False)])
 def test_limits(previous, wanted, seconds, rate, u, at_range, at_rate):
     bounds = InputLimits(np.array([-1.0]), np.array([5.0]), np.array([rate]))
     command, *active = limit(
-        bounds, np.array([wanted]), None if previous is None else np.array([previous]), seconds)
+        bounds, np.ones(1), np.array([wanted]),
+        None if previous is None else np.array([previous]), seconds)
     assert (command[0], *active) == (pytest.approx(u, rel=1e-15), at_range, at_rate)
 
 
