@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from koopman_ros.core.arrays import Array
+from koopman_ros.core.solvers import decaying
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.model import LiftedModel
 
@@ -133,7 +134,7 @@ def _beyond(model: LiftedModel, x: Array, u: Array, rate: Array) -> RestState:
     """Extrapolate from a state (n_x,) moving at a rate (n_x,) under (n_u,), all scaled."""
     slope = model.drift_jacobian(x) + model.forcing_jacobian(x, u)
     place, outside = np.full(model.n_x, np.nan), np.nan
-    if np.all(np.isfinite(slope)) and np.all(np.linalg.eigvals(slope).real < 0.0):
+    if np.all(np.isfinite(slope)) and decaying(np.linalg.eigvals(slope)).all():
         place = model.states.to_physical(x - np.linalg.solve(slope, rate))
         outside = model.distance(place)
     return RestState(place, outside, model.inputs.to_physical(

@@ -85,7 +85,9 @@ def _unusable_signals(model: LiftedModel) -> str:
             if low <= (0.0 if unit == 'K' else -math.inf):
                 return (f'the trained range of {name} begins at {low:.4g} {unit}, which is '
                         'impossible: train the model again from other data')
-            if not low <= center <= high:
+            # a signal that stood at an end of its range has this mean but for rounding
+            rounding = 1e-9 * (high - low)
+            if not low - rounding <= center <= high + rounding:
                 remedy = ('record data around a steady state' if kind == 'state' else
                           f'record {name} {"down" if center < low else "up"} to {text(center)}')
                 return (f'the nominal {name}, {text(center)}, is outside its trained range, '

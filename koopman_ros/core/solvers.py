@@ -5,15 +5,16 @@
 
 from collections.abc import Callable
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg.lapack import dgees, dgeev, dgesv
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.status import StatusCode
 
-__all__ = ['RiccatiSolution', 'differences', 'over_interval', 'solve_riccati',
+__all__ = ['RiccatiSolution', 'decaying', 'differences', 'over_interval', 'solve_riccati',
            'spectral_radius']
 
 # A double eigenvalue of the Hamiltonian on the imaginary axis comes out split by about the square
@@ -224,6 +225,19 @@ def _size(matrix: Array) -> float:
     """Return the Frobenius norm."""
     flat = matrix.ravel()
     return math.sqrt(flat.dot(flat))
+
+
+def decaying(eigenvalues: NDArray[np.inexact[Any]], tolerance: float = 1e-8
+             ) -> NDArray[np.bool_]:
+    """
+    Return which modes (..., n) of a linear system decay.
+
+    :param eigenvalues: (..., n), not in any order.
+    :param tolerance: of the fastest mode: rounding moves the eigenvalue of an integrator to either
+        side of 0, and those of a double integrator by the square root of the precision.
+    """
+    size = np.max(np.abs(eigenvalues), axis=-1, keepdims=True, initial=0.0)
+    return np.asarray(eigenvalues.real < -tolerance * size)
 
 
 def differences(function: Callable[[Array], Array], x: Array, scale: Array) -> Array:

@@ -322,7 +322,7 @@ def _run(given: LoopBatch, feedbacks: Sequence[_Feedback], cases: tuple[Array, A
                             v[0, :, j] = commands[number - given.whole_samples[j]][:, j]
                     else:
                         v[k][:, now] = act(y[k, :, :n] + noise, active[k])[:, now]
-                steps = math.ceil(given.steps * length / given.interval)
+                steps = math.ceil(given.steps * (length / given.interval))
                 ahead = integrate(lambda y: flow(y, v), y, length, steps)
                 y = np.where(active[..., None], ahead, y)
         at_target = arrived()

@@ -269,11 +269,12 @@ def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | No
         linear, tuning.state_weight, tuning.input_weight))
     interval = max(interval / model.seconds_per_time_unit, 1.0 / (_SAMPLES * fastest))
     dead_time = float(np.max(model.dead_time)) / model.seconds_per_time_unit
-    samples = math.ceil((_DURATION / slowest + dead_time) / interval)
+    # rounding adds no sample and no step where the slowest mode is the fastest, too
+    samples = math.ceil((_DURATION / slowest + dead_time) / interval - _RESOLUTION)
     loops = min(loops, max(_MOST_CALLS // samples, _FEWEST_LOOPS))
     starts, targets, inputs = _cases(plant, limits, loops, seed)
     given = LoopBatch(plant, replace(tuning, limits=limits), law, interval, samples,
-                      math.ceil(_STEPS * interval * fastest),
+                      math.ceil(_STEPS * interval * fastest - _RESOLUTION),
                       np.zeros(model.n_x) if noise is None else noise / model.states.scale)
     parts = {f'loops from {first + 1} on': (
         starts[first:first + _PART], targets[first:first + _PART], inputs[first:first + _PART])

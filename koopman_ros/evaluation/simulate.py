@@ -170,7 +170,7 @@ def simulate(controller: Controller, plant: Plant, events: Iterable[ScheduledCha
         except RuntimeError as error:
             failure = str(error)
             break
-        while waiting and waiting[0].seconds <= seconds:
+        while waiting and round(waiting[0].seconds * NANOSECONDS) <= time_ns - start_ns:
             what = waiting.pop(0).what
             loop = what(loop) if callable(what) else _answered(loop, what)[0]
         x, u = loop.plant.x, loop.plant.u

@@ -67,7 +67,7 @@ def _modes(model: LiftedModel, rate: Rate, x: Array, v: Array | None = None
         v = plant.holding(x, np.zeros((len(x), model.n_u)))
     slope = plant.slope(x, v)[..., :n]
     values = np.linalg.eigvals(np.where(np.isfinite(slope), slope, 0.0)).astype(np.complex128)
-    return np.take_along_axis(values, np.argsort(-values.real, axis=1), axis=1)
+    return np.take_along_axis(values, np.argsort(-values.real, axis=1, kind='stable'), axis=1)
 
 
 def unfounded_instability(model: LiftedModel, found: Identified,

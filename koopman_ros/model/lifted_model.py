@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from koopman_ros.core.arrays import Array, frozen, pseudo_inverse, short_repr, show_printed
 from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.integration import adaptive
+from koopman_ros.core.solvers import decaying
 from koopman_ros.core.units import (
     check_time_unit,
     display_unit,
@@ -262,7 +263,7 @@ class LiftedModel:
     def eigenvalues(self) -> NDArray[np.complex128]:
         """Eigenvalues (n_z,) of A in 1/time unit, slowest (largest real part) first."""
         values = np.linalg.eigvals(self.A).astype(np.complex128)
-        return values[np.argsort(-values.real)]
+        return values[np.argsort(-values.real, kind='stable')]
 
     def disturbance_rate(self, d: Array) -> Array:
         """Evaluate E d, the rate due to disturbances (..., n_d), in their units: (..., n_x)."""
@@ -367,7 +368,7 @@ class LiftedModel:
     @cached_property
     def is_hurwitz(self) -> bool:
         """Whether every mode of A decays."""
-        return bool(np.all(self.eigenvalues.real < 0.0))
+        return bool(decaying(self.eigenvalues).all())
 
     @cached_property
     def adds_unstable_modes(self) -> bool:
@@ -377,7 +378,7 @@ class LiftedModel:
         Both under the pre-feedback, if there is one.
         """
         slope = self.linearised.A + self.pre_feedback_slope
-        grow = [int(np.sum(eigenvalues.real >= 0.0))
+        grow = [int(np.sum(~decaying(eigenvalues)))
                 for eigenvalues in (self.eigenvalues, np.linalg.eigvals(slope))]
         return grow[0] > grow[1]
 

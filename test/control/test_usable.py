@@ -56,6 +56,12 @@ def test_reason_has_the_figure_and_the_remedy(ends: list[int], words: str) -> No
         assert not unusable(model), unusable(model)
 
 
+def test_a_nominal_value_may_be_off_an_end_of_the_range_by_rounding() -> None:
+    low = np.array([300.1])
+    states = replace(SHIPPED.states, lower=low, center=np.array([np.nextafter(low[0], 0.0)]))
+    assert not unusable(replace(SHIPPED, states=states))
+
+
 def test_shipped_models_are_usable() -> None:
     for path in model_path('reactor_nz4').parent.glob('*.safetensors'):
         assert not unusable(load(path)), path

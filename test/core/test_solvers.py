@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import block_diag, expm, solve_continuous_are, solve_discrete_are
 
 from koopman_ros.core.integration import runge_kutta_step
-from koopman_ros.core.solvers import over_interval, solve_riccati, spectral_radius
+from koopman_ros.core.solvers import decaying, over_interval, solve_riccati, spectral_radius
 from koopman_ros.core.status import StatusCode
 
 SIZES = [(n, m) for n in range(1, 9) for m in range(1, 4)]
@@ -286,3 +286,15 @@ def test_a_matrix_that_is_not_finite_has_no_stable_eigenvalues(n, value):
               np.diag([*[0.5] * (n - 1), value])):
         assert spectral_radius(M) == np.inf
     assert spectral_radius(0.5 * np.eye(n)) == 0.5
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_an_integrator_does_not_decay_on_whichever_side_rounding_leaves_its_eigenvalue(seed):
+    rng = np.random.default_rng(seed)
+    # an integrator, a double one, and modes that decay
+    blocks = (np.zeros((1, 1)), np.eye(2, k=1), np.diag([-1.0, -3.0, -1e-4]))
+    T = np.linalg.qr(rng.normal(size=(6, 6)))[0]
+    values = np.linalg.eigvals(T @ block_diag(*blocks) @ T.T)
+    assert np.count_nonzero(decaying(values)) == 3
+    assert np.count_nonzero(decaying(-values)) == 0
+    assert not decaying(np.zeros(2, complex)).any()

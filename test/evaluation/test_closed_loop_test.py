@@ -24,6 +24,7 @@ from koopman_ros.evaluation.closed_loop_test import (
     evaluate_closed_loops,
     statement,
 )
+from koopman_ros.execution import Serial
 from koopman_ros.model import (
     Coordinates,
     LiftedModel,
@@ -62,6 +63,21 @@ def two_states(B=B):
 
 def two_state_rate(x, u):
     return TWO.scale * (TWO.to_deviation(x) @ A.T + INPUTS.to_deviation(u) @ B.T)
+
+
+def test_as_many_samples_and_steps_however_the_rates_are_rounded():
+    """With one state the slowest mode is the fastest, and both numbers are whole."""
+    sizes = set()
+
+    class Looking(Serial):
+        def run(self, function, parts, *, shared, watch):
+            sizes.add((shared.samples, shared.steps))
+            yield from ()
+
+    for a in np.random.default_rng(0).uniform(-2.0, 2.0, 40):
+        assert evaluate_closed_loops(scalar(a), linear_rate(a), interval=1e-3, loops=4,
+                                     backend=Looking()) is None
+    assert len(sizes) == 1
 
 
 def test_on_a_linear_plant_the_law_is_the_linear_one():

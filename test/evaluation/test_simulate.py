@@ -240,6 +240,18 @@ def test_the_operator_moves_the_input_of_a_loop(case):
     np.testing.assert_allclose(found.commands[5:], [case.held + by] * 6, rtol=1e-12)
 
 
+def test_an_event_at_the_time_of_a_sample_is_of_that_sample():
+    """3 x 0.7 s is less than 2.1 s in floating-point numbers."""
+    case = CASES['reactor_nz4']
+    there = Process(case.plant, 0, case.goal, case.held)
+    found = simulate(
+        controller(case), there, [at(0.0, Initialisation(case.held)), *(
+            at(seconds, ModeChange(mode)) for seconds, mode in (
+                (2.1, Mode.MANUAL), (4.2, Mode.AUTOMATIC)))], period=0.7, duration=5.6)
+    manual = [level == 'manual' for level in found.levels]
+    assert manual == [False] * 3 + [True] * 3 + [False] * 3
+
+
 def test_a_rejected_request_ends_the_simulation_with_its_reason():
     with pytest.raises(ValueError, match='set-point 200 K is outside the trained range 305 K to'):
         run(CASES['reactor_nz4'], at(1.0, SetpointRequest(0, np.array([200.0]))))

@@ -28,6 +28,7 @@ _PACKAGE = 'daqp'
 # Largest change of a scaled input after which a plan has converged, and with which it may be used.
 _CONVERGED, _USABLE = 1e-4, 0.05
 _MAX_ITERATIONS = 12
+_ROUNDING = 1e-9  # error of a distance from the training data, in half-ranges
 _CHECKED = 3  # every third node, and the last, is checked for its distance from the training data
 
 
@@ -132,7 +133,7 @@ class RecedingHorizon(Law):
                              passing=True)
         # a state outside the training data may return from there
         here, *ahead = self.model.distances(np.concatenate((x[:-1:_CHECKED], x[-1:]))).tolist()
-        if max(ahead) > max(self.margin, here):
+        if max(ahead) > max(self.margin, here) + _ROUNDING:
             return LawResult(None, reason(
                 StatusCode.PLAN_OUTSIDE, outside=max(ahead), margin=self.margin))
         plan = planner.plan(problem, u, x)

@@ -20,6 +20,7 @@ from koopman_ros.core.arrays import short_repr
 from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.datasets import Array, Episode, PlantDescription, sample_interval
 from koopman_ros.core.integration import runge_kutta_step
+from koopman_ros.core.solvers import decaying
 from koopman_ros.learning.identification.simulation import fitted, simulated
 from koopman_ros.model import Box, InputTerms, PolynomialObservables
 from koopman_ros.model.observables import Monomials
@@ -105,8 +106,14 @@ class Drift(ABC):
 
     @property
     def growth_rate(self) -> float:
-        """Real part of the fastest growing mode in the middle of the box, in 1/time unit."""
-        return float(np.max(np.linalg.eigvals(self.slope(self.box.states.center)).real))
+        """
+        Real part of the fastest growing mode in the middle of the box, in 1/time unit.
+
+        0 for an integrator, on whichever side of 0 rounding leaves its eigenvalue.
+        """
+        modes = np.linalg.eigvals(self.slope(self.box.states.center))
+        moving = decaying(modes) | decaying(-modes)
+        return float(np.max(np.where(moving, modes.real, 0.0)))
 
     @property
     def input_matrix(self) -> Array:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.core.arrays import Array, short_repr
+from koopman_ros.core.solvers import decaying
 from koopman_ros.learning.identification.drift import Drift, DriftModel
 from koopman_ros.model import Coordinates
 
@@ -66,7 +67,7 @@ class NetworkDrift(Drift):
     @property
     def bounded(self) -> bool:
         """Whether the state stays bounded with bounded inputs, whatever the network is."""
-        return bool(np.all(np.linalg.eigvals(self.A).real < 0.0))
+        return bool(decaying(np.linalg.eigvals(self.A)).all())
 
     @property
     def drift(self) -> NetworkDrift:

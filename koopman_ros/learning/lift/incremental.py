@@ -236,7 +236,7 @@ def _least_spanned_product(grown: TrainedLift, data: ScaledSamples) -> Tensor:
     else:
         values, vectors = torch.linalg.eig(parameters.A.T)
         z = _lifted(grown.layout, parameters, data).z
-    slowest = torch.argsort(values.real, descending=True)[:max(2, x.shape[1])]
+    slowest = torch.argsort(values.real, descending=True, stable=True)[:max(2, x.shape[1])]
     functions = z.to(values.dtype) @ vectors[:, slowest]
     basis = z if grown.layout.n_z else z[:, :0]
     # degree by degree, so that the slow, smooth products come first

@@ -422,6 +422,15 @@ def test_plan_outside_the_data_is_not_followed():
     assert compute(one, [0.5, 0.0]).failure is None
 
 
+def test_plan_that_rests_outside_the_data_is_followed():
+    """Rounding of the estimate puts its later states further outside than the first."""
+    _, model = linear_plant(np.diag([-1.0, -2.0]), np.eye(2), reach=1.0)
+    x = np.array([1.3, 0.2])
+    found = compute(law(model, learned_model_margin=0.1), x * (1.0 - 1e-13), x)
+    assert found.failure is None
+    np.testing.assert_allclose(found.u, -model.A @ x, atol=1e-6)
+
+
 @pytest.mark.parametrize('x', [[math.nan, 0.0], [math.inf, 0.0], [1e300, 0.0]])
 def test_state_that_is_not_finite_has_no_plan(x):
     with np.errstate(all='ignore'):
