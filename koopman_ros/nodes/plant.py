@@ -144,9 +144,9 @@ class PlantNode(ManagedNode):
             self._resynchronise()
         elif self._settings.speed:
             # the next tick, in a period from now, is that of the next sample
-            self._tick.reset()
             passed = (self._sample - 1) * self._period_ns / NANOSECONDS
             self._wall_start = time.monotonic() - passed / self._settings.speed
+            self._tick.reset()
 
     def _latched(self, topic: str, kind: Any) -> Any:
         return self._endpoints.publish(topic, kind, topics.LATCHED_QOS)
@@ -162,16 +162,17 @@ class PlantNode(ManagedNode):
         if self._sample == 0:
             # time begins now, and the next tick is in a period from now: after a first one that
             # was late, all stamps would be ahead of the clock
-            self._tick.reset()
-            self._wall_start = time.monotonic()
             if self._real_time:
                 self._start_ns = time.time_ns()
                 self._plant.skip_to(self._start_ns)
+            self._wall_start = time.monotonic()
+            self._tick.reset()
         if self._phase is not RunPhase.RUNNING:
             return
         if self._settings.speed:
-            # a timer skips the periods that it missed, and so do the samples
-            due = round((self._now_ns() - self._start_ns) / self._period_ns)
+            # a timer skips the periods that it missed, and so do the samples; a late one is of the
+            # period that has begun, not of the next one, whose stamp would be ahead of the clock
+            due = (self._now_ns() - self._start_ns) // self._period_ns
             self._sample = max(self._sample, due)
         self._measure()
 

@@ -16,7 +16,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
 from sensor_msgs.msg import JointState, Temperature
 
-from koopman_ros.core.units import LAST_STAMP_SECONDS, seconds_text
+from koopman_ros.core.units import LAST_STAMP_SECONDS, NANOSECONDS, seconds_text
 from koopman_ros.demo import reactor
 from koopman_ros.nodes import plant as plant_module
 from koopman_ros.nodes.plant import PlantNode
@@ -84,8 +84,6 @@ class Bench:
     def start_afresh(self) -> None:
         """Bring the plant back to its steady state, and forget the rest."""
         self.coolant = NOMINAL_COOLANT
-        self.ros.set_parameters('plant', **{
-            name: row.default for name, row in TABLE.rows.items() if not row.read_only})
         self.ros.trigger('plant/reset')
         self.wait_for_more(3)
         del self.measured[:], self.ros.statuses[:]
@@ -394,3 +392,22 @@ def test_the_time_of_an_inactive_plant_does_not_advance(
     shared_ros.wait_until(lambda: len(measured) >= 8)
     node.destroy_node()
     assert [seconds(late) - seconds(early) for early, late in pairwise(measured)] == [1.0] * 7
+
+
+def test_stamps_are_never_ahead_of_the_clock(
+        shared_ros: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In real time, where a busy machine is late by more than half a period."""
+    clock = SimpleNamespace(now=1000.0)
+    monkeypatch.setattr(plant_module, 'time', SimpleNamespace(
+        monotonic=lambda: clock.now, time_ns=lambda: round(clock.now * NANOSECONDS)))
+    node = PlantNode(context=shared_ros.node.context, cli_args=['--ros-args', '-r', '__ns:=/late'])
+    node.start()
+    measured = shared_ros.listen(Temperature, '/late/temperature')
+    shared_ros.wait_until(lambda: node.count_subscribers('/late/temperature'))
+    for wait in (0.0, 1.6, 0.4, 1.0, 2.7, 0.3):
+        clock.now += wait
+        node._step_in_time()
+    shared_ros.wait_until(lambda: len(measured) >= 6)
+    node.destroy_node()
+    assert [seconds(message) for message in measured] == [
+        1000.0, 1001.0, 1002.0, 1003.0, 1005.0, 1006.0]
