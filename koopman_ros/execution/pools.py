@@ -247,6 +247,7 @@ class Cluster(_Pool):
     @contextlib.contextmanager
     def _messages(self, call: bytes) -> Generator[_Messages]:
         import distributed
+        from distributed.client import ClosedClientError
         token, messages = uuid.uuid4().hex, queue.SimpleQueue[tuple[int, Any]]()
         event = distributed.Event(token, client=self._client)
 
@@ -256,7 +257,7 @@ class Cluster(_Pool):
             return [messages.get() for _ in range(messages.qsize())]
 
         def stop() -> None:
-            with contextlib.suppress(OSError, RuntimeError):
+            with contextlib.suppress(OSError, RuntimeError, ClosedClientError):
                 event.set()
 
         self._client.subscribe_topic(token, lambda message: messages.put(message[1]))
@@ -265,7 +266,8 @@ class Cluster(_Pool):
             source = self._client.submit(bytes, call, pure=False)
             yield partial(_to_topic, token), source, received, stop
         finally:
-            with contextlib.suppress(OSError, ValueError, RuntimeError):
+            # a client that lost its scheduler is closed at any moment
+            with contextlib.suppress(OSError, ValueError, RuntimeError, ClosedClientError):
                 self._client.unsubscribe_topic(token)
 
 
