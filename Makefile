@@ -79,7 +79,7 @@ test: $(VENV)/test.stamp  ## lint, type checks and the whole test suite, on all 
 	    --max-worker-restart 0 -o faulthandler_exit_on_timeout=true; \
 	  tests=$$?; wait $$types || tests=1; cat $(VENV)/mypy.log; exit $$tests
 
-test-machines: $(VENV)/test.stamp  ## numerical tests under emulated processors, 15 min (MACHINES=--quick: 90 s)
+test-machines: $(VENV)/test.stamp  ## numerical tests under each OpenBLAS kernel of this processor, one and two threads, 40 min (MACHINES=--quick: two other kernels, 3 min)
 	$(BIN)/python test/machines.py $(MACHINES)
 
 lint: $(VENV)/test.stamp  ## lint and type checks

@@ -83,6 +83,7 @@ setup(
             'ruff',
             'safetensors',
             'setuptools<80',
+            'threadpoolctl',
         ],
     },
     entry_points={
