@@ -16,6 +16,7 @@ import pytest
 from koopman_ros.execution import backend_of, SchedulerLost, Serial, WorkerLost
 from koopman_ros.execution.pools import Cluster, Processes
 from koopman_ros.parameters.trainer_table import trainer_table
+from support.nodes import TIMEOUT
 
 KINDS = ('', 'process', 'joblib:2', 'dask')
 
@@ -143,10 +144,10 @@ def test_a_process_has_one_thread_and_ignores_an_interrupt(monkeypatch):
 
 
 def test_a_scheduler_that_does_not_answer_or_has_no_worker(monkeypatch):
-    monkeypatch.setattr('koopman_ros.execution.pools._CONNECT', 0.3)
-    monkeypatch.setattr('koopman_ros.execution.pools._JOIN', 0.1)
-    with pytest.raises(SchedulerLost, match=r'no scheduler answers at tcp://127\.0\.0\.1:9 '):
-        backend_of('tcp://127.0.0.1:9')
+    with monkeypatch.context() as impatient:
+        impatient.setattr('koopman_ros.execution.pools._CONNECT', 0.3)
+        with pytest.raises(SchedulerLost, match=r'no scheduler answers at tcp://127\.0\.0\.1:9 '):
+            backend_of('tcp://127.0.0.1:9')
     import distributed
 
     def cluster(workers):
@@ -154,8 +155,14 @@ def test_a_scheduler_that_does_not_answer_or_has_no_worker(monkeypatch):
             n_workers=workers, threads_per_worker=1, processes=False, host='127.0.0.1',
             protocol='tcp://', dashboard_address='127.0.0.1:0', silence_logs=logging.CRITICAL)
 
-    with cluster(0) as empty, pytest.raises(WorkerLost, match='has no worker: start one'):
-        Cluster(empty.scheduler_address)
+    # a busy machine takes its time to connect
+    monkeypatch.setattr('koopman_ros.execution.pools._CONNECT', TIMEOUT)
+    with cluster(0) as empty, monkeypatch.context() as impatient:
+        impatient.setattr('koopman_ros.execution.pools._JOIN', 0.1)
+        with pytest.raises(WorkerLost, match='has no worker: start one'):
+            Cluster(empty.scheduler_address)
+    monkeypatch.setattr('koopman_ros.execution.pools._JOIN', TIMEOUT)
+
     def until_lost(_, __, tell):
         while not tell(0):
             time.sleep(0.01)

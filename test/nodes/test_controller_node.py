@@ -24,13 +24,13 @@ from koopman_ros.model import load, save
 from koopman_ros.nodes.controller import ControllerNode
 from koopman_ros.ros import signals, topics
 from koopman_ros.testing import Harness
-from support.controller_bench import Bench, reproduced, STATUS, STEADY, until_read
-from support.nodes import RunNode, seconds, temperature, value
+from support.controller_bench import Bench, PURE, reproduced, STATUS, STEADY
+from support.nodes import RunNode, seconds, temperature, TIMEOUT, until_read, value
 
 
 @pytest.fixture(scope='module')
 def shared_bench(shared_ros: Harness) -> Bench:
-    return Bench(shared_ros)
+    return Bench(shared_ros, PURE)
 
 
 @pytest.fixture
@@ -399,19 +399,16 @@ def test_a_safe_coolant_outside_the_training_range_is_reported(
 
 
 def test_two_controllers_report_each_other_while_both_run(
-        ros: Harness, run_node: RunNode) -> None:
+        ros: Harness, run_node: RunNode, monkeypatch: pytest.MonkeyPatch) -> None:
     """Beside a best-effort thermometer, and a coolant that is promised and never told."""
     ros.node.create_publisher(Temperature, reactor.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
     bench = Bench(ros, qos=QoSProfile(
         depth=10, reliability=ReliabilityPolicy.BEST_EFFORT), run_node=run_node)
     assert bench.commands[0].temperature > 25.0
-    waited = []
+    # only the first measurement waited for the coolant
+    monkeypatch.setattr('koopman_ros.ros.signals._PATIENCE', 10.0 * TIMEOUT)
     for k in range(2, 12):
-        before = time.monotonic()
         bench.measure(STEADY - 1.0, float(k))
-        waited.append(time.monotonic() - before)
-    # on a busy machine some may be slow, but if they waited for the coolant all would be
-    assert min(waited) < 0.4
     # the temperature first measured is held
     assert bench.active == pytest.approx(STEADY)
     bench.status(lambda s: s.message.startswith('automatic, no set-point yet'))

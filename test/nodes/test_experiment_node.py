@@ -143,11 +143,8 @@ def test_an_obstacle_prevents_the_start_of_an_experiment(shared_bench: Bench) ->
     assert bench.ask(True)[1] == (
         'rejected: no newer measurement for more than 0.3 s: check sensor and plant')
     # a busy machine may be as slow
-    bench.set(experiment_timeout=10.0)
-
-    bench.set(**{'experiment_signal': 'manual'})
+    bench.set(experiment_timeout=10.0, experiment_signal='manual')
     assert 'start the controller and switch it to manual mode' in bench.start()[1]
-    bench.set(**{'experiment_signal': 'command'})
 
 
 def test_service_ends_the_steps_and_then_lets_go(shared_bench: Bench) -> None:
@@ -185,7 +182,6 @@ def test_silent_sensor_brings_the_safe_coolant(shared_bench: Bench) -> None:
     # a sensor that comes back is answered, with the same
     assert bench.answer() == pytest.approx(SAFE, abs=1e-9)
     assert bench.ask(False)[1] == LOST
-    bench.set(experiment_timeout=10.0, **{'coolant_temperature.experiment_rate_limit': 1.0})
 
 
 def test_another_commander_ends_it_at_once_and_rejects_the_next(shared_bench: Bench) -> None:
@@ -232,7 +228,6 @@ def test_one_input_in_manual_mode_until_the_controller_moves_it_elsewhere(
     ros.node.destroy_timer(timer)
     ros.node.destroy_publisher(controller)
     bench.ask(False)
-    bench.set(experiment_signal='command')
 
 
 def test_process_that_ends_without_measurements_leaves_the_inputs_where_they_are(

@@ -3,7 +3,7 @@
 
 """What the trainer records, how it starts and stops, and how a bag ends: kills, full disks."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 import re
 import shutil
@@ -123,9 +123,16 @@ def test_signal_completes_the_bag_with_all_that_arrived(ros: Harness, tmp_path: 
 
 
 @pytest.fixture(scope='module')
-def shared(shared_ros: Harness) -> Harness:
+def shared_trainer(shared_ros: Harness) -> Harness:
     shared_ros.start('trainer', {'record_at_start': False})
     return shared_ros
+
+
+@pytest.fixture
+def shared(shared_trainer: Harness) -> Iterator[Harness]:
+    """Yield the harness of a trainer that does not record, nor after the test."""
+    yield shared_trainer
+    shared_trainer.set_bool('trainer/record', False)
 
 
 def record(ros: Harness, output: Path, qos: QoSProfile = topics.LOOP_QOS, subscribers: int = 1

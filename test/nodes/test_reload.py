@@ -33,8 +33,8 @@ from koopman_ros.plants import Process
 from koopman_ros.ros import model_reload, topics
 from koopman_ros.testing import Harness
 from support.closed_loops import REACTOR
-from support.controller_bench import PATIENT, reproduced, STATUS, STEADY, until_read
-from support.nodes import change, opened, RunNode, temperature, value
+from support.controller_bench import PATIENT, reproduced, STATUS, STEADY
+from support.nodes import change, opened, RunNode, temperature, until_read, value
 
 NAMES = ('reactor_nz3', 'reactor_nz4', 'reactor_linear')
 SETPOINTS = [(20.0 * k, 46.0 + math.sin(k)) for k in range(1, 150)]

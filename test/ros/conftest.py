@@ -3,6 +3,6 @@
 
 """What ROS needs, in a domain of its own."""
 
-from support.nodes import ros, run_node, shared_ros, type_support
+from support.nodes import left_as_found, ros, run_node, shared_ros, type_support
 
-__all__ = ['ros', 'run_node', 'shared_ros', 'type_support']
+__all__ = ['left_as_found', 'ros', 'run_node', 'shared_ros', 'type_support']

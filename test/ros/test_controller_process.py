@@ -25,8 +25,8 @@ from koopman_ros.nodes.plant import PlantNode
 from koopman_ros.ros import topics
 from koopman_ros.ros.node import range_of
 from koopman_ros.testing import Harness
-from support.controller_bench import Bench, reproduced, STATUS, STEADY, TABLE
-from support.nodes import RunNode, seconds, temperature, value
+from support.controller_bench import Bench, PATIENT, reproduced, STATUS, STEADY, TABLE
+from support.nodes import RunNode, seconds, SharedHarness, temperature, value
 
 CONTROLLER = '/controller'
 SAFE = 5.0  # degC
@@ -34,7 +34,7 @@ SAFE = 5.0  # degC
 
 @pytest.fixture(scope='module')
 def running(shared_ros: Harness) -> Harness:
-    """Start one controller, whose parameters every test leaves as they were."""
+    """Start one controller for several tests."""
     shared_ros.start('controller')
     return shared_ros
 
@@ -60,13 +60,21 @@ def test_change_that_does_not_fit_is_rejected_with_the_reason(
         assert running.get_parameters(CONTROLLER, name) == [TABLE.rows[name].default]
 
 
+def test_a_shared_process_gets_back_what_a_test_has_set(running: SharedHarness) -> None:
+    changed = {'max_gain': 7.0, 'coolant_temperature.max': 30.0, 'recovery_time': 3.0}
+    assert all(result.successful for result in running.set_parameters(CONTROLLER, **changed))
+    assert running.set_parameters_atomically(CONTROLLER, max_gain=8.0).successful
+    running.set_parameters(CONTROLLER, no_such_thing=1.0)
+    running.restore()
+    assert running.get_parameters(CONTROLLER, *changed) == [
+        TABLE.rows[name].default for name in changed]
+
+
 def test_two_limits_that_cross_on_the_way_change_together(running: Harness) -> None:
-    default = {name: TABLE.rows[name].default for name in (
-        'coolant_temperature.min', 'coolant_temperature.max')}
-    for limits in ({'coolant_temperature.min': 40.0, 'coolant_temperature.max': 60.0}, default):
-        result = running.set_parameters_atomically(CONTROLLER, **limits)
-        assert result.successful, result.reason
-        assert running.get_parameters(CONTROLLER, *limits) == list(limits.values())
+    limits = {'coolant_temperature.min': 40.0, 'coolant_temperature.max': 60.0}
+    result = running.set_parameters_atomically(CONTROLLER, **limits)
+    assert result.successful, result.reason
+    assert running.get_parameters(CONTROLLER, *limits) == list(limits.values())
 
 
 @pytest.mark.parametrize(('changes', 'words'), [
@@ -350,7 +358,7 @@ def test_a_setpoint_without_a_stamp_takes_effect_at_once(ros: Harness, run_node:
 def test_a_signal_reported_on_change_is_in_each_measurement_and_a_late_one_in_the_estimate(
         ros: Harness, run_node: RunNode) -> None:
     run_node(ControllerNode, {
-        'system': 'two_tanks', 'level_1.report_on_change': 100.0,
+        **PATIENT, 'system': 'two_tanks', 'level_1.report_on_change': 100.0,
         'estimator': 'extended_kalman_filter', 'level_2.analysis_topic': 'laboratory',
         'level_2.analysis_delay': 60.0})
     records = ros.listen(String, topics.EVENT_LOG)

@@ -9,7 +9,6 @@ import time as clock
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
@@ -34,10 +33,6 @@ PATIENT = {'measurement_timeout': 0.0}
 # The law alone, which the temperature of a moment determines.
 PURE = {'observer_bandwidth': 0.0, 'bumpless_transfer_time': 0.0, 'stuck_sensor_timeout': 0.0,
         **PATIENT}
-# What a test may have set. The model is left out: it is read in a moment that a busy machine may
-# miss, and no test on a shared bench sets it.
-RESET = {name: PURE.get(name, row.default)
-         for name, row in TABLE.rows.items() if not row.read_only and name != 'model'}
 
 
 def reproduced(messages: Sequence[String]) -> tuple[list[EventRecord], list[float]]:
@@ -46,13 +41,6 @@ def reproduced(messages: Sequence[String]) -> tuple[list[EventRecord], list[floa
     samples = replay_records(records).samples
     assert [sample.recorded for sample in samples] == [sample.replayed for sample in samples]
     return records, [to_celsius(float(sample.recorded[0])) for sample in samples]
-
-
-def until_read(change: Callable[[], SetParametersResult]) -> SetParametersResult:
-    """Change a model, again if the machine is too busy to read it in the moment."""
-    while 'still being read' in (result := change()).reason:
-        pass
-    return result
 
 
 class Bench:
@@ -81,8 +69,6 @@ class Bench:
 
     def start_afresh(self) -> None:
         """Bring the controller back to its steady state at the time 1 s, and forget the rest."""
-        result = self.ros.set_parameters_atomically('controller', **RESET)
-        assert result.successful, result.reason
         self.ros.set_bool('controller/set_automatic', True)
         self.ask(STEADY)
         # no gap, which would be the interval of the samples

@@ -3,7 +3,7 @@
 
 """Of tests with nodes: fixtures, messages and statuses, programs and processes, pipes."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 import contextlib
 import errno
 import gc
@@ -18,6 +18,8 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 import pytest
+from rcl_interfaces.msg import Parameter, ParameterValue, SetParametersResult
+from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
 
@@ -59,12 +61,74 @@ def ros(tmp_path: Path) -> Iterator[Harness]:
         yield bench
 
 
+class SharedHarness(Harness):
+    """Remembers what the parameters of shared processes were before a test changed them."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self._before: dict[str, dict[str, ParameterValue]] = {}
+
+    def set_parameters(self, node: str, **values: Any) -> list[SetParametersResult]:
+        before = self._values(node, values)
+        results = super().set_parameters(node, **values)
+        self._remember(node, before, [result.successful for result in results])
+        return results
+
+    def set_parameters_atomically(self, node: str, **values: Any) -> SetParametersResult:
+        before = self._values(node, values)
+        result = super().set_parameters_atomically(node, **values)
+        self._remember(node, before, [result.successful] * len(values))
+        return result
+
+    def _values(self, node: str, names: Iterable[str]) -> dict[str, ParameterValue]:
+        found = self.call(GetParameters, f'{node}/get_parameters',
+                          GetParameters.Request(names=list(names))).values
+        # none where the node does not know one of the names
+        return dict(zip(names, found, strict=False))
+
+    def _remember(self, node: str, values: dict[str, ParameterValue], changed: list[bool]) -> None:
+        first = self._before.setdefault(node, {})
+        for (name, value), is_changed in zip(values.items(), changed, strict=False):
+            if is_changed:
+                first.setdefault(name, value)
+
+    def restore(self) -> None:
+        """Set all parameters back; a node that a test has ended is gone."""
+        before, self._before = self._before, {}
+        for node, values in before.items():
+            if not any(process.running for process in self.processes):
+                continue
+            request = SetParametersAtomically.Request(parameters=[
+                Parameter(name=name, value=value) for name, value in values.items()])
+            result = until_read(lambda node=node, request=request: self.call(
+                SetParametersAtomically, f'{node}/set_parameters_atomically', request).result)
+            assert result.successful, f'{node} keeps what a test has set: {result.reason}'
+
+
+def until_read(change: Callable[[], SetParametersResult]) -> SetParametersResult:
+    """Change parameters, again if the machine is too busy to read a model in the moment."""
+    while 'still being read' in (result := change()).reason:
+        pass
+    return result
+
+
 @pytest.fixture(scope='module')
-def shared_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Harness]:
+def shared_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SharedHarness]:
     """Yield the same for tests that use one process after each other."""
     folder = tmp_path_factory.mktemp('shared')
-    with Harness(folder) as bench:
+    with SharedHarness(folder) as bench:
         yield bench
+
+
+@pytest.fixture(autouse=True)
+def left_as_found(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Set back the parameters of shared processes, also after a test that failed."""
+    if 'shared_ros' not in request.fixturenames:
+        yield
+        return
+    shared = request.getfixturevalue('shared_ros')
+    yield
+    shared.restore()
 
 
 @contextlib.contextmanager
