@@ -86,32 +86,28 @@ class _Faceplate:
 
 class _Entry:
     """
-    Entry of a number: typed, stepped by the arrow keys, or by a slider.
+    Entry of a number: typed, stepped by the arrow keys, or moved by a slider.
 
     :param present: the requested value at present.
     """
 
     def __init__(self, page: PageLayout, title: str, send: Callable[[float], Any],
                  present: Callable[[Snapshot], float]) -> None:
-        self._page, self._send, self._step = page, send, 1.0
+        self._page, self._send = page, send
         self._shown = ''  # present value in the field until a user types
-        self._decimals = 0
         with box('ask') as self._box:
-            self._field = page.control(ui.input(title, on_change=self._typed).props(
+            self._field = page.control(ui.input(title).props(
                 'outlined dense inputmode=decimal autocomplete=off'))
             self._button = page.control(attribute(
                 ui.button('Set', on_click=self._submit).props('unelevated'), 'aria-label',
                 f'Set {title}'))
-        self._slider = page.control(attribute(ui.slider(
-            min=0.0, max=1.0, on_change=self._slid).props('color=grey-8'),
-            'aria-label', f'{title}, slider'))
+            # the page itself keeps slider and field alike, and steps by the arrow keys
+            self._slider = attribute(ui.element('input').props('type=range disabled'),
+                                     'aria-label', f'{title}, slider')
         self._answer = AnswerLine(page, lambda now: (
             now.mode, present(now), now.silent(PLANT), now.silent(CONTROLLER)))
-        for control in (self._field, self._slider):
-            control.on('keydown.enter', self._submit)
-            control.on('keydown.escape', self._reset)
-        self._field.on('keydown.up.prevent', lambda: self._move(1.0), args=[])
-        self._field.on('keydown.down.prevent', lambda: self._move(-1.0), args=[])
+        self._field.on('keydown.enter', self._submit)
+        self._field.on('keydown.escape', self._reset)
 
     def show(self, face: Faceplate, present: float, obstacle: str) -> None:
         """
@@ -119,48 +115,22 @@ class _Entry:
 
         :param obstacle: why nothing can be sent, or empty.
         """
-        self._decimals, self._step = face.decimals, 10.0 ** -face.decimals
         low, high = (round(end, face.decimals) for end in face.span)
-        found = {'min': low, 'max': high, 'step': self._step}
+        found = {'min': low, 'max': high, 'step': round(10.0 ** -face.decimals, 9),
+                 'disabled': bool(obstacle) or not self._field.enabled}
         if any(self._slider.props.get(name) != value for name, value in found.items()):
             self._slider.props.update(found)
-        for control in (self._field, self._button, self._slider):
+        for control in (self._field, self._button):
             self._page.allow(control, not obstacle, obstacle)
         text = face.exact(present) if math.isfinite(present) else ''
         if text and self._field.value == self._shown:
-            self._set(text)
+            self._field.set_value(text)
         self._shown = text
         attribute(self._box, 'data-present', text)
 
-    def _set(self, text: str) -> None:
-        self._field.set_value(text)
-
     def _reset(self) -> None:
-        self._set(self._shown)
+        self._field.set_value(self._shown)
         self._answer.set_text('')
-
-    def _value(self) -> float | None:
-        try:
-            return parsed_number(str(self._field.value))
-        except ValueError:
-            return None
-
-    def _move(self, steps: float) -> None:
-        if (value := self._value()) is not None:
-            self._set(number(value + steps * self._step, self._decimals))
-
-    def _slid(self, event: Any) -> None:
-        # the slider keeps within its ends a value that was typed beyond them
-        low, high = self._slider.props['min'], self._slider.props['max']
-        value = self._value()
-        if self._shown and (value is None or low <= value <= high) and isinstance(
-                event.value, int | float) and (
-                    value is None or abs(event.value - value) >= 0.5 * self._step):
-            self._set(number(event.value, self._decimals))
-
-    def _typed(self) -> None:
-        if (value := self._value()) is not None and value != self._slider.value:
-            self._slider.set_value(value)
 
     async def _submit(self) -> None:
         try:

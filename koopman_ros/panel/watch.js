@@ -59,7 +59,9 @@ addEventListener('DOMContentLoaded', () => {
     if (control && !unsent.contains(control)) press(control);
   }, true);
   addEventListener('keydown', event => {
-    if (event.key === 'Enter' && event.target.matches('input, [role=slider]')) press(event.target);
+    if (event.key === 'Enter' && event.target.matches('input:not([type=range])')) {
+      press(event.target);
+    }
   }, true);
   const wrap = socket => {
     const emit = socket.emit.bind(socket);
@@ -77,14 +79,42 @@ addEventListener('DOMContentLoaded', () => {
   watched.wrap = wrap;
   if (window.socket) wrap(window.socket);
 
-  // An entry that differs from the present value is marked as typed and not sent.
+  // An entry that differs from the present value is marked as typed and not sent. Its slider follows
+  // the text, and the text its slider; the arrow keys step both.
+  const number = text => Number(text.trim().replace(',', '.'));
+  const type = (field, value, step) => {
+    field.value = value.toFixed(Math.max(0, -Math.floor(Math.log10(step) + 1e-9)));
+    field.dispatchEvent(new Event('input', { bubbles: true }));
+  };
+  const parts = ask => [ask.querySelector('input:not([type=range])'),
+                        ask.querySelector('input[type=range]')];
   const mark = () => {
     for (const one of document.querySelectorAll('.ask[data-present]')) {
-      const typed = one.querySelector('input')?.value ?? '';
+      const [field, slider] = parts(one), typed = field?.value ?? '';
       one.classList.toggle('typed', typed !== '' && typed !== one.dataset.present);
+      if (slider && !Number.isNaN(number(typed))) slider.value = number(typed);
     }
   };
-  addEventListener('input', mark);
+  addEventListener('focusin', mark);
+  addEventListener('input', event => {
+    if (event.target.type === 'range') {
+      type(parts(event.target.closest('.ask'))[0], event.target.valueAsNumber, event.target.step);
+    }
+    mark();
+  });
+  addEventListener('keydown', event => {
+    const ask = event.target.closest?.('.ask[data-present]');
+    if (!ask || !event.target.matches('input')) return;
+    const [field, slider] = parts(ask), value = number(field.value);
+    if (event.target === slider && ['Enter', 'Escape'].includes(event.key)) {
+      field.dispatchEvent(new KeyboardEvent('keydown', { key: event.key, bubbles: true }));
+      if (event.key === 'Escape') slider.blur();
+    } else if (event.target === field && ['ArrowUp', 'ArrowDown'].includes(event.key)
+               && !Number.isNaN(value)) {
+      event.preventDefault();
+      type(field, value + (event.key === 'ArrowUp' ? 1 : -1) * slider.step, slider.step);
+    }
+  });
 
   // A row that moves, or appears, does nothing for half a second: a click was for the one before.
   const tops = new WeakMap(), timers = new WeakMap();

@@ -387,3 +387,67 @@ def test_a_measurement_beyond_its_limit_is_an_alarm(desk: Desk) -> None:
     with desk.page('/alarms', loop) as (_, page):
         expect(alarm(page, 'above its high limit 50 °C')).to_contain_text('HIGH')
         expect(alarm(page, 'from the set-point')).to_contain_text('MEDIUM')
+
+
+def test_alarms_are_filtered_sorted_selected_and_grouped_under_their_cause(desk: Desk) -> None:
+    with desk.page('/alarms') as (loop, page):
+        rows = page.get_by_role('list', name='Active alarms').get_by_role('listitem')
+        loop.status('controller: measurements', WARN, 'the last measurement is 9 s old')
+        expect(rows).to_have_count(1)
+        for task in ('set-point', 'model', 'actuators'):
+            loop.status(f'controller: {task}', WARN, f'not good: {task}')
+        loop.status('trainer: experiment', ERROR, 'aborted: no measurement')
+        loop.status('pump: motor', ERROR, 'tripped')
+        loop.status('pump: bearing', WARN, 'warm')
+        expect(rows).to_have_count(7)
+        cause = alarm(page, '9 s old')
+        expect(cause).to_contain_text('cause of 4 more')
+        expect(page.locator('.consequence')).to_have_count(4)
+        expect(page.locator('.consequence').filter(has_text='pump')).to_have_count(0)
+        # urgent ones of others are above
+        expect(rows.first).to_contain_text('tripped')
+        page.get_by_label('Filter').fill('pump')
+        expect(rows).to_have_count(2)
+        page.get_by_label('Filter').fill('')
+        expect(rows).to_have_count(7)
+        chosen = alarm(page, 'not good: model')
+        chosen.get_by_role('checkbox').click()
+        page.get_by_role('button', name='Acknowledge selected (1)').click()
+        expect(chosen).to_contain_text('acknowledged by anna')
+        page.get_by_label('Source').click()
+        page.get_by_role('option', name='pump').click()
+        expect(rows).to_have_count(2)
+        page.get_by_role('button', name='Acknowledge all of pump').click()
+        expect(rows.filter(has_text='acknowledged by anna')).to_have_count(2)
+        page.get_by_label('Source').click()
+        page.get_by_role('option', name='all').click()
+        page.get_by_label('Order').click()
+        page.get_by_role('option', name='oldest first').click()
+        expect(rows.first).to_contain_text('first-out')
+        expect(rows.first).to_contain_text('9 s old')
+
+
+def test_an_entry_is_operated_by_keys_and_refuses_an_ambiguous_number(desk: Desk) -> None:
+    with desk.page() as (loop, page):
+        ready(page)
+        own = face(page, 'temperature')
+        asked(page).press('ArrowUp')
+        expect(asked(page)).to_have_value('45.1')
+        asked(page).press('Escape')
+        expect(asked(page)).to_have_value('45.0')
+        slider = own.get_by_role('slider')
+        slider.focus()
+        slider.press('ArrowRight')
+        expect(asked(page)).to_have_value('45.1')
+        slider.press('Enter')
+        expect(own.locator('.value')).to_have_text('45.1 °C')
+        for text in ('1,234', '1.234,5'):
+            asked(page).fill(text)
+            asked(page).press('Enter')
+            expect(own.locator('.answer')).to_contain_text('two ways')
+        asked(page).fill('46,85')
+        asked(page).press('Enter')
+        expect(own.locator('.value')).to_have_text('46.85 °C')
+        assert [action.value for action in loop.asked] == [pytest.approx(45.1), 46.85]
+        asked(page).press('Tab')
+        expect(own.get_by_role('button', name='Set Set-point of temperature')).to_be_focused()

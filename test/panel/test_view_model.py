@@ -594,6 +594,40 @@ def test_each_warning_of_a_status_has_an_alarm_of_its_own() -> None:
         f'{CONTROL}: held: late', f'{CONTROL}: held: stuck for 6 s']
 
 
+def test_alarms_of_a_node_that_is_gone_are_stale_and_return() -> None:
+    own = view()
+
+    def looked(second: float) -> tuple[list[AlarmState], int]:
+        status(own, CONTROL, OK, 'automatic', {}, NOW + second)
+        own.advance(NOW + second)
+        now = own.snapshot(NOW + second)
+        found = [alarm for alarm in now.standing if alarm.source == 'pump']
+        return [alarm.state for alarm in found], sum(one.key in now.stale for one in found)
+
+    for second in range(3):
+        status(own, 'pump: bearing', ERROR, 'warm', {}, NOW + second)
+        looked(float(second))
+    assert looked(8.0) == ([AlarmState.UNACKNOWLEDGED], 0)
+    assert looked(15.0) == ([AlarmState.UNACKNOWLEDGED], 1)
+    looked(63.0)
+    assert looked(70.0) == ([AlarmState.RETURNED], 0)
+
+
+def test_a_line_has_a_gap_where_the_controller_was_silent() -> None:
+    own = view()
+    for second in (1.0, 2.0, 20.0, 21.0):
+        own.take_signals('commands', {'coolant_temperature': 300.0}, second, NOW + second)
+        measure(own, 50.0, second)
+    for second in range(3, 20):
+        measure(own, 50.0, float(second))
+    for second in (1.0, 2.0, 20.0, 21.0):
+        own.take_signals('commands', {'coolant_temperature': 300.0}, second + 30.0,
+                         NOW + second + 30.0)
+    _, values = own.trends.window(['coolant_temperature command'], 0.0, 60.0)[
+        'coolant_temperature command']
+    assert int(np.isnan(values).sum()) == 3
+
+
 def test_an_alarm_of_a_measurement_has_a_delay_and_a_deadband() -> None:
     own = view()
     own.limits = {'temperature': ProcessLimits(
