@@ -18,7 +18,6 @@ import re
 import secrets
 import stat
 import sys
-import threading
 import unicodedata
 
 from argon2 import extract_parameters, PasswordHasher
@@ -62,8 +61,6 @@ class Users:
         self._users = dict(users)
         # compared for an unknown name, which so takes as long as a known one
         self._decoy = _HASHER.hash(secrets.token_hex())
-        # one log-in at a time: the memory of argon2 is taken once
-        self._turn = threading.Lock()
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> 'Users':
@@ -82,11 +79,10 @@ class Users:
         if len(password) > MAX_PASSWORD:
             return None
         user = self._users.get(normalised(name[:MAX_PASSWORD]))
-        with self._turn:
-            try:
-                _HASHER.verify(user.secret if user else self._decoy, normalised(password))
-            except (Argon2Error, InvalidHashError, UnicodeEncodeError):
-                return None
+        try:
+            _HASHER.verify(user.secret if user else self._decoy, normalised(password))
+        except (Argon2Error, InvalidHashError, UnicodeEncodeError):
+            return None
         return user.role if user else None
 
     def __len__(self) -> int:

@@ -19,6 +19,7 @@ from koopman_ros.panel.layout import (
     box,
     clock,
     label,
+    Lines,
     link,
     PageLayout,
     show_if,
@@ -117,8 +118,7 @@ def alarm_page(page: PageLayout) -> None:
         label('h2', 'Shelved alarms')
         shelved = _AlarmRows('Shelved alarms', lambda alarm: _shelved_row(page, alarm))
         label('h2', 'Last 24 hours')
-        day = box('card journal').props('role=list aria-label="Last 24 hours"')
-    shown: list[Any] = [None]
+        day = Lines('Last 24 hours')
 
     def show(now: Snapshot) -> None:
         standing.show(choice.rows(now.standing), now)
@@ -128,18 +128,10 @@ def alarm_page(page: PageLayout) -> None:
         page.allow(selected, bool(chosen), 'select alarms by their boxes')
         of_source.set_text(f'Acknowledge all of {choice.source or "a source"}')
         page.allow(of_source, bool(choice.source), 'choose a source')
-        entries = page.source.view.alarms.journal(now.wall - _DAY)[:_LISTED]
-        if shown[0] == entries:
-            return
-        shown[0] = entries
-        day.clear()
-        with day:
-            for entry in entries:
-                who = f' by {entry.who}' if entry.who else ''
-                label('div', f'{clock(entry.time)}  {entry.priority.word}  {entry.what}{who}: '
-                      f'{entry.text}').props('role=listitem')
-            if not entries:
-                label('div', 'none', 'quiet')
+        day.show([
+            f'{clock(entry.time)}  {entry.priority.word}  {entry.what}'
+            f'{f" by {entry.who}" if entry.who else ""}: {entry.text}'
+            for entry in page.source.view.alarms.journal(now.wall - _DAY)[:_LISTED]])
 
     page.follow(show)
 

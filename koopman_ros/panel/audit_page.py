@@ -14,7 +14,7 @@ from typing import Any
 
 from nicegui import ui
 
-from koopman_ros.panel.layout import box, label, PageLayout
+from koopman_ros.panel.layout import box, label, Lines, PageLayout
 from koopman_ros.panel.requests import AuditEntry
 from koopman_ros.panel.snapshot import Snapshot
 
@@ -29,22 +29,12 @@ def audit_page(page: PageLayout) -> None:
             ui.button('Export CSV', on_click=lambda: ui.download.content(
                 exported(page.source.view.audit), 'audit.csv')).props('outline')
             wanted = ui.input('Filter').props('outlined dense clearable')
-        rows = box('card journal').props('role=list aria-label=Actions')
-    shown: list[Any] = [None]
+        rows = Lines('Actions')
 
     def show(_: Snapshot) -> None:
         text = str(wanted.value or '').casefold()
-        entries = [line for entry in reversed(page.source.view.audit)
-                   if text in (line := line_of(entry)).casefold()][:_LISTED]
-        if shown[0] == entries:
-            return
-        shown[0] = entries
-        rows.clear()
-        with rows:
-            for line in entries:
-                label('div', line).props('role=listitem')
-            if not entries:
-                label('div', 'none', 'quiet')
+        rows.show([line for entry in reversed(page.source.view.audit)
+                   if text in (line := line_of(entry)).casefold()][:_LISTED])
 
     page.follow(show)
 

@@ -283,6 +283,25 @@ def unacknowledged(alarms: Sequence[Alarm]) -> list[Alarm]:
     return [alarm for alarm in alarms if alarm.state is not AlarmState.ACKNOWLEDGED]
 
 
+class Lines:
+    """List of lines, which is drawn again when they change."""
+
+    def __init__(self, name: str, none: str = 'none') -> None:
+        self._none = none
+        self._shown: Sequence[str] | None = None
+        self._list = attribute(box('card journal').props('role=list'), 'aria-label', name)
+
+    def show(self, lines: Sequence[str]) -> None:
+        """Show these lines."""
+        if lines == self._shown:
+            return
+        self._shown = lines
+        self._list.clear()
+        with self._list:
+            for line in lines or [self._none]:
+                label('div', line).props('role=listitem')
+
+
 def show_if(element: Element, shown: bool) -> None:
     """Show or hide an element."""
     if shown is ('hidden' in element.classes):

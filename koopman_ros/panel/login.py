@@ -5,6 +5,7 @@
 
 import asyncio
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from html import escape
 from importlib.resources import files
@@ -14,7 +15,6 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
-from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
 from koopman_ros.panel.access import Users
@@ -70,8 +70,11 @@ def add_login(app: FastAPI, source: Source, keeper: AccessControl) -> None:
             title=escape(source.title), message=shown,
             query=f'?page={page}' if page in TABS else ''), status, {'cache-control': 'no-store'})
 
+    # one log-in at a time takes the memory of argon2, and no thread of the pages
+    verifier = ThreadPoolExecutor(1, 'log-in')
+
     @app.get('/login', response_model=None)
-    def login_page(page: str = '/') -> Response:
+    async def login_page(page: str = '/') -> Response:
         return RedirectResponse('/', 303) if keeper.users is None else login_form(page)
 
     @app.post('/login', response_model=None)
@@ -91,7 +94,8 @@ def add_login(app: FastAPI, source: Source, keeper: AccessControl) -> None:
         address = request.client.host if request.client else ''
         if wait := keeper.throttle.attempt(address, name):
             return form(f'too many attempts: try again in {math.ceil(wait)} s', 429)
-        role = await run_in_threadpool(keeper.users.verify, name, password)
+        role = await asyncio.get_running_loop().run_in_executor(
+            verifier, keeper.users.verify, name, password)
         if role is None:
             return form('name or password is wrong', 401)
         keeper.throttle.succeeded(address, name)
@@ -99,11 +103,11 @@ def add_login(app: FastAPI, source: Source, keeper: AccessControl) -> None:
         return RedirectResponse(page if page in TABS else '/', 303)
 
     @app.get('/session', status_code=204)
-    def session() -> None:
+    async def session() -> None:
         """Respond to a user who is logged in; to others, no address but that to log in does."""
 
     @app.get('/logout', response_model=None)
-    def log_out(request: Request) -> Response:
+    async def log_out(request: Request) -> Response:
         keeper.sessions.close(keeper.session_id(request.scope))
         request.session.clear()
         return RedirectResponse('/login', 303)

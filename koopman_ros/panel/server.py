@@ -35,6 +35,7 @@ from koopman_ros.panel.overview import overview
 from koopman_ros.panel.trend_page import trend_page
 from koopman_ros.panel.tuning_page import tuning_page
 
+MAX_SOCKETS = 60  #: open pages of a user
 _START = 10.0  # s until the server has started
 _POLL = 0.02  # s between two looks at a server that starts
 _STOP = 3.0  # s until it has ended
@@ -272,15 +273,25 @@ def _guard_sockets(keeper: AccessControl, command_timeout: float) -> None:
     def named(message: Any) -> Any:
         return message.get('client_id') if isinstance(message, dict) else None
 
-    connect, handshake = (sockets.handlers['/'][name] for name in ('connect', 'handshake'))
+    connect, handshake, disconnect = (
+        sockets.handlers['/'][name] for name in ('connect', 'handshake', 'disconnect'))
+    users: dict[str, str] = {}  # by socket
+
+    def on_disconnect(sid: str) -> None:
+        users.pop(sid, None)
+        disconnect(sid)
 
     async def on_connect(sid: str, environ: dict[str, Any], *rest: Any) -> bool:
         scope = environ['asgi.scope']
+        user = getattr(keeper.session(scope, use=False), 'name', '')
+        if list(users.values()).count(user) >= MAX_SOCKETS:
+            return False
         for client_id in parse_qs(scope['query_string'].decode('latin-1')).get('client_id', ()):
             # NiceGUI reloads a page of an earlier run of the panel
             if client_id in Client.instances and not own(scope, client_id):
                 return False
         await connect(sid, environ, *rest)
+        users[sid] = user
         return True
 
     async def on_handshake(sid: str, message: Any) -> bool:
@@ -311,6 +322,7 @@ def _guard_sockets(keeper: AccessControl, command_timeout: float) -> None:
     sockets.on('event', on_event)
     sockets.on('connect', on_connect)
     sockets.on('handshake', on_handshake)
+    sockets.on('disconnect', on_disconnect)
     for name in ('javascript_response', 'ack'):
         sockets.on(name, guarded(sockets.handlers['/'][name]))
     # browsers cannot write to the log of the panel

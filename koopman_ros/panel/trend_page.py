@@ -6,11 +6,10 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 from nicegui import ui
 
-from koopman_ros.panel.layout import box, label, PageLayout, show_if
+from koopman_ros.panel.layout import box, label, Lines, PageLayout, show_if
 from koopman_ros.panel.snapshot import Snapshot
 from koopman_ros.panel.trend_chart import EPOCH, SPANS, TrendChart
 
@@ -37,22 +36,13 @@ def trend_page(page: PageLayout) -> None:
                   'hover to read values and events', 'quiet')
         chart = TrendChart(page, 290, zoom=True)
         label('h2', 'Events')
-        events = box('card journal').props('role=list aria-label=Events')
-    shown: list[Any] = [None]
+        events = Lines('Events', 'none in this period')
 
     def show(_: Snapshot) -> None:
         chart.update()
         show_if(past, not chart.live)
-        if shown[0] == chart.marks:
-            return
-        shown[0] = chart.marks
-        events.clear()
-        with events:
-            for mark in reversed(chart.marks):
-                label('div', f'{_clock(mark.time)}  {mark.kind}: {mark.text}').props(
-                    'role=listitem')
-            if not chart.marks:
-                label('div', 'none in this period', 'quiet')
+        events.show([f'{_clock(mark.time)}  {mark.kind}: {mark.text}'
+                     for mark in reversed(chart.marks)])
 
     def end() -> float | None:
         return time_of_day(str(until.value), page.source.view.trends.latest or 0.0)

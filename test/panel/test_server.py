@@ -27,7 +27,8 @@ import pytest
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
-from koopman_ros.panel import trend_chart
+from koopman_ros.panel import server, trend_chart
+from koopman_ros.panel.access import Users
 from koopman_ros.panel.connections import Listener, RateLimiter
 from koopman_ros.panel.layout import clock
 from koopman_ros.panel.server import PanelServer
@@ -253,6 +254,51 @@ def until(condition: Callable[[], bool]) -> None:
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.01)
+
+
+def test_the_open_pages_of_a_user_are_bounded(
+        site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, 'MAX_SOCKETS', 2)
+    olga = site.cookie('olga')
+
+    def answer(own: ClientConnection) -> str:
+        assert received(own).startswith('0{')
+        own.send('40')
+        return received(own)[:2]
+
+    with contextlib.ExitStack() as stack:
+        def connected(cookie: str) -> str:
+            return answer(stack.enter_context(opened(site, cookie, {}, OTHER, '', '', {})))
+
+        assert [connected(olga) for _ in range(3)] == ['40', '40', '44']
+        assert connected(site.cookie('anna')) == '40'
+    # those that are closed do not count
+    with contextlib.ExitStack() as stack:
+        until(lambda: connected(olga) == '40')
+
+
+def test_the_page_to_log_in_does_not_wait_for_passwords_that_are_verified(
+        site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    over = threading.Event()
+    begun: list[str] = []
+
+    def verify(own: Users, name: str, password: str) -> None:
+        begun.append(name)
+        assert over.wait(TIMEOUT)
+
+    monkeypatch.setattr(Users, 'verify', verify)
+    tries = [threading.Thread(target=lambda at=at: site.log_in(
+        'olga', 'wrong', source=PROXY, **forwarded(f'10.9.0.{at}'))) for at in range(60)]
+    try:
+        for one in tries:
+            one.start()
+        until(lambda: len(begun) == 1)
+        assert site.ask('GET', '/login').status == 200
+        assert len(begun) == 1
+    finally:
+        over.set()
+        for one in tries:
+            one.join()
 
 
 def test_sockets_are_websockets_alone(site: Site) -> None:
