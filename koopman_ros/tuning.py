@@ -104,11 +104,11 @@ class Tuning:
 
     state_weight: Array = column(
         'states', 0.0, 'Weight of the squared control error of this '
-                       'state.', '1/({unit})^2', maximum=1e12,
+                       'state.', '1/({unit})^2', maximum=1e30,
         name='weight')
     input_weight: Array = column(
         'inputs', 1.0, 'Weight of the squared deviation of this input from its steady value.',
-        '1/({unit})^2', maximum=1e12, open_minimum=True, name='weight')
+        '1/({unit})^2', maximum=1e30, open_minimum=True, name='weight')
     limits: InputLimits = nested(InputLimits)
     dead_time: Array = column(
         'inputs', -1.0, 'Dead time between this input, as commanded or measured, and its effect; '

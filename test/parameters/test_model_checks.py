@@ -121,3 +121,13 @@ def test_model_that_cannot_be_used_is_rejected_in_a_short_sentence(
     assert len(str(rejected.value)) < 250
     # nor does training accept it
     assert name != 'reactor_nz4' or re.search(words, usable.unusable(SHIPPED))
+
+
+def test_a_controller_is_built_for_states_of_nanoamperes() -> None:
+    states = SHIPPED.states
+    tiny = with_states(units=('A',), **{
+        name: 1e-9 * getattr(states, name) for name in ('center', 'scale', 'lower', 'upper')})
+    table = table_of(tiny, {'system': ''})
+    settings = table.snapshot({})
+    assert table.check(settings) == ''
+    assert built(settings, tiny).tuning.state_weight == pytest.approx(1.0 / tiny.states.scale ** 2)
