@@ -38,7 +38,7 @@ class CuttingRules:
     times_local: float = 6.0
     #: so many changes by the smallest difference of two values make it the resolution
     fewest_steps: int = 3
-    #: passes; where spikes are close to each other, those left show once others are dropped
+    #: searches for spikes; some show once others are dropped
     passes: int = 5
 
 
@@ -65,15 +65,23 @@ def spikes_and_jumps(values: Array, least: float = 0.0, rules: CuttingRules = RU
     for _ in range(rules.passes):
         kept = np.flatnonzero(~spike)
         found = _far_from_neighbours(values[kept], least, rules)
+        # also a single one on a ramp, whose neighbours differ: it leaps away and back
+        large = _large_changes(values[kept], least, rules)
+        found[1:-1] |= large[:-1] * large[1:] < 0
         spike[kept[found]] = True
         if not found.any():
             break
     kept = np.flatnonzero(~spike)
-    change = np.abs(np.diff(values[kept]))
-    jump[kept[1:]] = change > max(
-        rules.times_usual * float(np.percentile(change, rules.usual)),
-        rules.share_of_range * _range(values[kept], rules), least)
+    jump[kept[1:]] = _large_changes(values[kept], least, rules) != 0
     return spike, jump
+
+
+def _large_changes(values: Array, least: float, rules: CuttingRules) -> NDArray[np.int64]:
+    """Return the signs of changes that are no motion, 0 for others."""
+    change = np.diff(values)
+    limit = max(rules.times_usual * float(np.percentile(np.abs(change), rules.usual)),
+                rules.share_of_range * _range(values, rules), least)
+    return np.where(np.abs(change) > limit, np.sign(change), 0.0).astype(np.int64)
 
 
 def _far_from_neighbours(values: Array, least: float, rules: CuttingRules) -> NDArray[np.bool_]:

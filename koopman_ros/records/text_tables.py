@@ -12,6 +12,7 @@ import itertools
 from pathlib import Path
 import re
 from typing import Any, NamedTuple
+import warnings
 
 # A number, a date or a time; other texts with digits are names.
 _VALUE = re.compile(r'[-+.,]?\d(?:[^A-Za-z]|[eE][-+]?\d|T(?=\d)|Z|\s?[AaPp]\.?[Mm]\.?'
@@ -81,10 +82,13 @@ def read_text_table(path: Path, rules: TextTableRules = TextTableRules()) -> Tex
         if not (ended or cut):
             notes = [f'line {first + rows.line_num}, the last one, has no end: its last number '
                      'may be cut short']
-    frame = pd.read_csv(
-        path, sep=head.separator, header=None, names=range(width), index_col=False, dtype=str,
-        keep_default_na=False, skip_blank_lines=False, skipinitialspace=True, skiprows=first,
-        encoding=encoding).apply(lambda column: column.str.strip())
+    with warnings.catch_warnings():
+        # about longer rows: those left are comments
+        warnings.simplefilter('ignore', pd.errors.ParserWarning)
+        frame = pd.read_csv(
+            path, sep=head.separator, header=None, names=range(width), index_col=False, dtype=str,
+            keep_default_na=False, skip_blank_lines=False, skipinitialspace=True, skiprows=first,
+            encoding=encoding).apply(lambda column: column.str.strip())
     frame.index = frame.index + first + 1
     repeated = (frame[list(range(len(head.headers)))] == head.headers).all(axis=1)
     comment = frame[0].str.startswith('#') & (frame[0] != '#')

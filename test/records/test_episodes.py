@@ -348,16 +348,28 @@ def test_jumps_after_a_rest(values: np.ndarray, jumps: list[int]) -> None:
     assert found(values) == [[], jumps]
 
 
-@pytest.mark.parametrize('share', [0.01, 0.055, 0.1, 0.2])
+@pytest.mark.parametrize('share', [0.01, 0.055, 0.1, 0.15])
 def test_spikes_are_found_whatever_their_share(share: float) -> None:
     rng = np.random.default_rng(5)
     values = 50.0 + 20.0 * np.sin(np.arange(600) / 30.0)
     spiked = np.sort(rng.choice(np.arange(3, 597), round(600 * share), replace=False))
     values[spiked] += rng.choice([60.0, 45.0], len(spiked))
     spikes, jumps = found(values)
-    assert len(np.setxor1d(spikes, spiked)) <= 0.01 * len(spiked) + 0.04 * 600 * share * (
-        share > 0.1)
-    assert share > 0.1 or jumps == []
+    assert set(spiked.tolist()) <= set(spikes)
+    # a sample with spikes on both sides may be taken for one of them
+    assert (len(spikes) - len(spiked) <= 1, jumps) == (True, [])
+
+
+def test_spikes_on_ramps_are_found() -> None:
+    goal = np.repeat(np.random.default_rng(1).uniform(20.0, 90.0, 20), 30)
+    values = [20.0]
+    for one in goal[:-1]:
+        values.append(values[-1] + 0.08 * (one - values[-1]))
+    spiked = np.arange(2, 600, 31)
+    leaping = np.array(values)
+    leaping[spiked] += 40.0
+    assert found(np.array(values)) == [[], []]
+    assert found(leaping) == [spiked.tolist(), []]
 
 
 @pytest.mark.parametrize('step', [0.5, 1.0])
