@@ -44,7 +44,7 @@ pytestmark = pytest.mark.filterwarnings('ignore:.torch.distributed.reduce_op. is
 
 HOST = 'panel.example'
 PROXY, OTHER = '127.0.0.1', '127.0.0.9'
-TIMEOUT = 30.0
+TIMEOUT = 120.0
 
 
 class Answered(NamedTuple):

@@ -29,7 +29,9 @@ from koopman_ros.ros.time_conversion import stamp_message, stamp_nanoseconds
 from koopman_ros.testing import Harness, isolated_domain
 
 RunNode = Callable[..., ManagedNode]
-TIMEOUT = 120.0  # s; a test that waits this long has failed, on a busy machine, too
+# In s; a test that waits this long has failed, on a busy machine, too, where a process of low
+# priority gets a fiftieth of a core.
+TIMEOUT = 500.0
 
 
 def temperature(celsius: float, seconds: float = 0.0) -> Temperature:
@@ -57,7 +59,7 @@ def type_support() -> None:
 @pytest.fixture
 def ros(tmp_path: Path) -> Iterator[Harness]:
     """Yield a node in a domain of its own, which starts processes and talks to them."""
-    with Harness(tmp_path) as bench:
+    with Harness(tmp_path, timeout=TIMEOUT) as bench:
         yield bench
 
 
@@ -65,7 +67,7 @@ class SharedHarness(Harness):
     """Remembers what the parameters of shared processes were before a test changed them."""
 
     def __init__(self, folder: Path) -> None:
-        super().__init__(folder)
+        super().__init__(folder, timeout=TIMEOUT)
         self._before: dict[str, dict[str, ParameterValue]] = {}
 
     def set_parameters(self, node: str, **values: Any) -> list[SetParametersResult]:
