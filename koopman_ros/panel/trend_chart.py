@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import colorsys
 from dataclasses import dataclass, replace
 import math
@@ -29,6 +29,7 @@ _ALL: Range = (0.0, 1.0)  # shares of the time shown
 _PAUSE = 0.3  # s between two updates of a zoom
 EPOCH = 1e9  #: s; a later stamp is a wall time, an earlier one is a simulated time
 _GROUP = 1.0 / 15.0  # of the time shown; nearer events are one mark
+_NEAR = 0.06  # of the height of a chart; lines that are nearer have one label
 _LEAST = 0.1  # of the range of a signal, which an axis shows
 _HEAD, _FOOT = 56, 44  # pixels above and below the plot of a chart
 # Pixels for the names of pens in charts from these widths on, as in style.css.
@@ -170,9 +171,10 @@ class TrendChart:
                       for _, pens in self._charts],
             'series': [{'name': own.title,
                         'data': _points(values[own.key][0] + zone, values[own.key][1]),
-                        'markLine': {'data': _lines(own, faces[own.signal],
-                                                    marks if own is pens[0] else ())}}
-                       for _, pens in self._charts for own in pens]})
+                        'markLine': {'data': lines if own is chart_pens[0] else []}}
+                       for _, chart_pens in self._charts
+                       for lines in [_lines(chart_pens, faces, marks)]
+                       for own in chart_pens]})
 
 
 def plan_end(now: Snapshot, latest: float) -> float:
@@ -223,14 +225,28 @@ def axis_ends(spans: Sequence[Range], pens: Sequence[Array]) -> dict[str, float 
             'max': round(math.ceil((middle + 0.5 * least) / step) * step, 6)}
 
 
-def _lines(own: _Pen, face: Faceplate, marks: Sequence[MarkGroup]) -> list[dict[str, Any]]:
-    """Return the limits of a signal as horizontal lines, and events as vertical ones."""
-    ranges = {'trained': face.training, 'limit': face.limits} if (
-        own.kind in ('measured', 'commands')) else {}
+def _lines(pens: Sequence[_Pen], faces: Mapping[str, Faceplate], marks: Sequence[MarkGroup]
+           ) -> list[dict[str, Any]]:
+    """Return the limits of the signals of a chart as horizontal lines, and events as vertical."""
+    spans = [faces[own.signal].span for own in pens]
+    height = max(high for _, high in spans) - min(low for low, _ in spans)
     # the chart fails at an end that is not finite
-    found: list[dict[str, Any]] = [
-        {'yAxis': end, 'name': f'{own.label} {name}'} for name, bounds in ranges.items()
-        for end in bounds or () if math.isfinite(end)]
+    ends = sorted((end, f'{own.label} {name}') for own in pens
+                  if own.kind in ('measured', 'commands')
+                  for name, bounds in (('trained', faces[own.signal].training),
+                                       ('limit', faces[own.signal].limits))
+                  for end in bounds or () if math.isfinite(end))
+    found: list[dict[str, Any]] = []
+    labelled: dict[str, Any] = {'yAxis': -math.inf, 'name': ''}
+    for end, name in ends:
+        # labels of lines that are near would cover each other: they have one
+        if end - labelled['yAxis'] >= _NEAR * height:
+            labelled = {'yAxis': end, 'name': name}
+            found.append(labelled)
+            continue
+        if name not in labelled['name'].split(', '):
+            labelled['name'] += f', {name}'
+        found.append({'yAxis': end, 'name': ''})
     return found + [{
         'xAxis': 1e3 * mark.time, 'name': mark.label, 'text': mark.text.replace('; ', '\n'),
         'symbol': 'circle',
@@ -325,7 +341,7 @@ def _options(charts: _Charts, height: int, zoom: bool) -> dict[str, Any]:
             {'type': 'inside', 'xAxisIndex': list(several), 'filterMode': 'none'},
             {'type': 'slider', 'xAxisIndex': list(several), 'bottom': 6, 'height': 24,
              'filterMode': 'none', 'showDataShadow': False, 'labelFormatter': '', **grey}],
-        'series': [{'type': 'line', 'name': own.title, 'showSymbol': False,
+        'series': [{'type': 'line', 'name': own.title, 'symbol': 'none',
                     'xAxisIndex': at, 'yAxisIndex': at, 'data': [],
                     'step': 'end' if own.steps else False,
                     'color': ink(number), 'markLine': marked,

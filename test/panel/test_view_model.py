@@ -39,7 +39,7 @@ from koopman_ros.panel.snapshot import (
     TRAINER,
     WARN,
 )
-from koopman_ros.panel.trend_chart import _charts
+from koopman_ros.panel.trend_chart import _charts, _lines, line
 from koopman_ros.panel.view_model import LoopViewModel
 from koopman_ros.parameters.description import ParameterDescription
 from koopman_ros.parameters.panel import ProcessLimits
@@ -758,3 +758,16 @@ def test_an_action_is_a_line_of_json() -> None:
     assert json.loads(AuditEntry.of(action, Answer(False, 'outside'), 12.3456).text()) == {
         'stamp': 12.346, 'who': '<script>', 'what': 'setpoint temperature', 'old': 'nan',
         'new': 45.0, 'accepted': False, 'answer': 'outside'}
+
+
+def test_limits_that_are_near_in_a_chart_have_one_label_and_pens_differ_without_colour() -> None:
+    own = view(TANKS)
+    own.take_model({'level_1': (0.1, 1.0), 'level_2': (0.102, 1.0)}, {})
+    now = own.snapshot(NOW)
+    pens = _charts(now)[0][1]
+    lines = _lines(pens, {face.name: face for face in now.states}, [])
+    assert [(one['yAxis'], one['name']) for one in lines] == [
+        (0.1, 'level 1 trained, level 2 trained'), (0.102, ''),
+        (1.0, 'level 1 trained, level 2 trained'), (1.0, '')]
+    # no two measurements of a chart have the same dashes
+    assert len({str(line('measured', place)) for place in range(5)}) == 5
