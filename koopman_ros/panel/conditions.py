@@ -42,7 +42,7 @@ _REPEATED, _WITHIN = 5, 60.0
 _PRIORITIES = {CONNECTIONS: Priority.HIGH, EXPERIMENT: Priority.LOW, TRAINING: Priority.LOW,
                RECORDING: Priority.MEDIUM}
 #: tasks and silences from causes to consequences
-_CAUSES = ('silence of plant', 'silence of controller', f'{PLANT}: ', MEASUREMENTS, CONTROL,
+_CAUSES = (f'{PLANT}: ', 'silence of plant', 'silence of controller', MEASUREMENTS, CONTROL,
            f'{CONTROLLER}: ', 'process: ', f'{TRAINER}: ')
 _SPREADS = 30.0  # s within which the consequences of a cause are raised
 _NUMBER = re.compile(r'(?<![\w.])[-+]?\d+(\.\d+)?(e[-+]\d+)?')
@@ -67,7 +67,10 @@ def grouped(alarms: Sequence[Alarm]) -> list[tuple[Alarm, Sequence[Alarm]]]:
         if head is None:
             heads.append(alarm)
         causes.setdefault((head or alarm).key, []).extend([alarm] if head else [])
-    return [(alarm, causes[alarm.key]) for alarm in alarms if alarm in heads]
+    order = {alarm.key: at for at, alarm in enumerate(alarms)}
+    # a group is as urgent as its most urgent alarm
+    return sorted(((alarm, causes[alarm.key]) for alarm in heads), key=lambda group: min(
+        order[one.key] for one in (group[0], *group[1])))
 
 
 def _said(task: str, text: str) -> str:

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from koopman_ros.core.units import display_unit, to_kelvin
-from koopman_ros.panel.alarms import AlarmState, Priority
+from koopman_ros.panel.alarms import Alarms, AlarmState, Priority
+from koopman_ros.panel.conditions import grouped
 from koopman_ros.panel.faceplates import pen, span_text
 from koopman_ros.panel.model_page import experiment_obstacle
 from koopman_ros.panel.requests import (
@@ -592,6 +593,21 @@ def test_each_warning_of_a_status_has_an_alarm_of_its_own() -> None:
     assert sorted(alarm.text for alarm in own.snapshot(NOW + 26.0).standing
                   if alarm.text.startswith(CONTROL)) == [
         f'{CONTROL}: held: late', f'{CONTROL}: held: stuck for 6 s']
+
+
+def test_the_cause_is_nearest_to_the_plant_and_a_group_as_urgent_as_its_worst_alarm() -> None:
+    alarms = Alarms(delay_on=0.0)
+    for second, (key, priority) in enumerate((
+            ('other: io', Priority.MEDIUM), ('plant: simulation: stopped', Priority.LOW),
+            ('silence of plant', Priority.HIGH), ('controller: control: held', Priority.HIGH))):
+        alarms.report(key, True, priority, key, NOW + second)
+    found = [(cause.key, [one.key for one in rest]) for cause, rest in grouped(alarms.standing)]
+    assert found == [
+        ('plant: simulation: stopped', ['silence of plant', 'controller: control: held']),
+        ('other: io', [])]
+    # what is raised much later has another cause
+    alarms.report('trainer: training: failed', True, Priority.LOW, '', NOW + 100.0)
+    assert [cause.key for cause, _ in grouped(alarms.standing)][-1].startswith('trainer')
 
 
 def test_alarms_of_a_node_that_is_gone_are_stale_and_return() -> None:
