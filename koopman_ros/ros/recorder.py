@@ -27,12 +27,13 @@ from rosgraph_msgs.msg import Clock
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.records import BagWriter, message_definition
 from koopman_ros.ros import topics
+from koopman_ros.ros.missed_messages import MissedMessages
 from koopman_ros.ros.time_conversion import stamp_nanoseconds
 
 # An unlimited duration [ns]: RMW_DURATION_INFINITE.
 _INFINITE_NS = 2**63 - 1
 # Five seconds at 1 kHz wait here while the disk is slow; Fast DDS keeps no more than this.
-_QUEUE_DEPTH = 5000
+QUEUE_DEPTH = 5000
 _LINGER = 0.1  # s
 _CLOCK_PATIENCE = 1.0  # s from the start until the first /clock should be there
 _LONGEST_WAY_NS = 1_000_000_000  # from sending to receipt, on a machine that is busy
@@ -82,21 +83,28 @@ class Recorder:
         self._subscriptions: dict[str, Subscription] = {}
         self._empty_ns: dict[str, int] = {}  # when nothing waited in each
         self.counts: dict[str, int] = dict.fromkeys(self._types, 0)
+        self._missed = MissedMessages(node)
         self._at_take = get_rmw_implementation_identifier() in _STAMPED_AT_TAKE
         self._start_time = time.monotonic()
         self.simulated = bool(node.get_parameter('use_sim_time').value)
         # 0 before the first /clock
         self._now_ns = node.get_clock().now().nanoseconds if self.simulated else 0
         self._clock = self._subscribed(
-            topics.CLOCK, Clock, topics.profile(_QUEUE_DEPTH, reliable=False)
+            topics.CLOCK, Clock, topics.profile(QUEUE_DEPTH, reliable=False)
         ) if self.simulated else None
         self.complaint = ''  #: about the time of receipt, for the operator; empty for none
         self.look_for_publishers()
+
+    @property
+    def missed(self) -> dict[str, int]:
+        """The number of messages that were sent and not received, of topics that missed any."""
+        return self._missed.counts
 
     def look_for_publishers(self) -> None:
         """Subscribe to newly discovered topics, with their publishers' quality of service."""
         self._look_for_the_clock()
         for topic in list(self._types):
+            self._missed.look_for_publishers(topic)
             publishers = self._node.get_publishers_info_by_topic(topic)
             if self._types[topic] is None and publishers:
                 try:
@@ -108,7 +116,7 @@ class Recorder:
             if (message_type := self._types[topic]) is None:
                 continue
             _, usual = self._known.get(self._names[topic], (None, topics.LOOP_QOS))
-            wanted = topics.matching_profile(usual, publishers, _QUEUE_DEPTH)
+            wanted = topics.matching_profile(usual, publishers, QUEUE_DEPTH)
             existing = self._subscriptions.get(topic)
             if existing is not None:
                 present = existing.qos_profile
@@ -118,6 +126,7 @@ class Recorder:
                     continue
                 self._end([topic])
             self._subscriptions[topic] = self._subscribed(topic, message_type, wanted)
+            self._missed.watch(self._subscriptions[topic])
 
     def _subscribed(self, topic: str, message_type: Any, qos: QoSProfile) -> Subscription:
         self._empty_ns[topic] = time.time_ns()
@@ -149,6 +158,7 @@ class Recorder:
     def take(self) -> None:
         """Record the received messages."""
         self._record_in_order(self._subscriptions)
+        self._missed.look_for_events()
 
     def flush(self) -> None:
         """Pass the recorded messages to the operating system."""
@@ -171,19 +181,22 @@ class Recorder:
             self._record_in_order(subscriptions)
         finally:
             for subscription in subscriptions.values():
+                self._missed.end(subscription)
                 self._node.destroy_subscription(subscription)
 
     def _waiting(self, topic: str, subscription: Subscription) -> list[_Taken]:
         waiting: list[_Taken] = []
         with (handle := subscription.handle):
             # no more than can wait, lest a fast publisher keeps us here
-            while len(waiting) < _QUEUE_DEPTH:
+            while len(waiting) < QUEUE_DEPTH:
                 now_ns = time.time_ns()
                 taken = take_raw(handle, subscription.msg_type)
                 if taken is None:
                     self._empty_ns[topic] = now_ns
                     break
                 data, info = taken
+                if subscription is not self._clock:
+                    self._missed.on_message(topic, info)
                 received_ns = receipt_ns(info, now_ns, self._empty_ns[topic], self._at_take)
                 waiting.append(_Taken(
                     topic, data, received_ns, info['source_timestamp'] or received_ns))

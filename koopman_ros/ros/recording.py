@@ -3,7 +3,7 @@
 
 """Recording by the trainer: starts and stops, names, disk space, errors."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import contextlib
 import datetime
 from functools import partial
@@ -75,7 +75,11 @@ class Recording:
         if self._problem:
             raise OSError(self._problem)
         text = f'recorded {sum(recorder.counts.values())} messages to {self._path}'
-        self._node.get_logger().info(text)
+        if missed := _missed_text(recorder.missed):
+            text += f'; {missed}'
+            self._node.get_logger().warning(text)
+        else:
+            self._node.get_logger().info(text)
         return text
 
     def flushed(self) -> str:
@@ -156,13 +160,20 @@ class Recording:
             return TaskReport(Severity.ERROR, self._problem) if self._problem else TaskReport(
                 Severity.OK, 'not recording')
         counts = self._recorder.counts
-        complaint = self._recorder.complaint
-        return TaskReport(Severity.WARN if complaint else Severity.OK,
-                          f'recording to {self._path}' + (
-            f'; {complaint}' if complaint else ''), {
+        missed = self._recorder.missed
+        complaints = [*filter(None, (self._recorder.complaint, _missed_text(missed)))]
+        return TaskReport(Severity.WARN if complaints else Severity.OK,
+                          '; '.join([f'recording to {self._path}', *complaints]), {
             'bag': os.path.abspath(self._path),
             'messages': sum(counts.values()),
+            'missed messages': sum(missed.values()),
             **{f'messages on {topic}': count for topic, count in counts.items()}})
+
+
+def _missed_text(missed: Mapping[str, int]) -> str:
+    return '' if not missed else (
+        f'missed {", ".join(f"{count} messages on {topic}" for topic, count in missed.items())}: '
+        'lower the load of this machine, or increase the queue depth of the publisher')
 
 
 def free_name(requested: Path) -> Path:

@@ -26,7 +26,7 @@ from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.ros.remote_node import repeated
-from koopman_ros.ros.topics import DIAGNOSTICS, LOOP_QOS
+from koopman_ros.ros.topics import DIAGNOSTICS, LOOP_QOS, node_name
 from koopman_ros.testing.process import given_domain, isolated_domain, NodeProcess
 
 _TURN = 0.05  # s; how long the node listens before a condition is looked at again
@@ -205,9 +205,20 @@ class Harness:
 
     def speak(self, kind: Any, topic: str, qos: QoSProfile = LOOP_QOS, *,
               to: str, subscribers: int = 1) -> Publisher:
-        """Return a publisher after a node, and a number of subscribers, have connected."""
+        """
+        Return a publisher after a node and a number of subscriptions have connected.
+
+        The number includes the node's own. A message that is sent before the publisher has
+        discovered a subscription does not reach it.
+        """
         publisher = self.node.create_publisher(kind, topic, qos)
-        self.wait_until(lambda: publisher.get_subscription_count() >= subscribers)
+        receiver = f'/{to.lstrip("/")}'
+
+        def connected() -> bool:
+            return (receiver in map(node_name, self.node.get_subscriptions_info_by_topic(
+                publisher.topic_name)) and publisher.get_subscription_count() >= subscribers)
+
+        self.wait_until(connected, f'no subscription of {receiver} to {publisher.topic_name}')
         self.meet(to)
         return publisher
 

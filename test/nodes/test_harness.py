@@ -10,6 +10,7 @@ import signal
 import sys
 
 import pytest
+from sensor_msgs.msg import Temperature
 
 from koopman_ros.records import summary
 from koopman_ros.testing import (
@@ -81,6 +82,13 @@ def test_a_process_that_does_not_end_is_aborted_with_its_stack(
         assert stubborn.running
     assert stubborn.stop() == code
     assert words in stubborn.output()
+
+
+def test_a_publisher_waits_for_the_node_and_not_for_another_subscriber(tmp_path: Path) -> None:
+    with Harness(tmp_path, timeout=1.0) as ros:
+        ros.listen(Temperature, 'elsewhere')
+        with pytest.raises(HarnessError, match='no subscription of /trainer to /elsewhere'):
+            ros.speak(Temperature, 'elsewhere', to='trainer')
 
 
 def test_example_of_the_page_passes(tmp_path: Path) -> None:

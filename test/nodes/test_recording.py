@@ -26,7 +26,7 @@ from koopman_ros.demo import reactor
 from koopman_ros.nodes import trainer
 from koopman_ros.nodes.trainer import TrainerNode
 from koopman_ros.records import BagMessage, read_messages, summary
-from koopman_ros.ros import topics
+from koopman_ros.ros import recorder, topics
 from koopman_ros.ros.recording import free_name
 from koopman_ros.ros.time_conversion import stamp_message
 from koopman_ros.testing import Harness
@@ -35,6 +35,7 @@ from support.nodes import complaint, run_here, RunNode, temperature, TIMEOUT
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 TOPIC = '/temperature'
 STATUS = 'trainer: recording'
+ON_TOPIC = f'messages on {TOPIC}'
 
 
 def recorded(bag: Path, topic: str = TOPIC) -> list[BagMessage]:
@@ -51,6 +52,15 @@ def say(publisher: Publisher, count: int, first: int = 0) -> None:
     for k in range(first, first + count):
         publisher.publish(temperature(float(k), float(k)))
     assert publisher.wait_for_all_acked(Duration(seconds=TIMEOUT))
+
+
+def figures(ros: Harness, condition: Callable[[dict[str, str]], bool]) -> dict[str, str]:
+    """Wait for figures of the recording's status, and return them."""
+    def those(status: DiagnosticStatus) -> dict[str, str]:
+        return {item.key: item.value for item in status.values}
+
+    return those(ros.wait_for_status(
+        STATUS, lambda status: 'messages' in those(status) and condition(those(status))))
 
 
 def say_until(ros: Harness, publisher: Publisher, condition: Callable[[], object]) -> int:
@@ -129,6 +139,9 @@ def shared(shared_trainer: Harness) -> Iterator[Harness]:
 def record(ros: Harness, output: Path, qos: QoSProfile = topics.LOOP_QOS, subscribers: int = 1
            ) -> Publisher:
     """Start to record into a file; return a publisher that is recorded from now on."""
+    # a subscription of the recording before is not taken for one of this
+    ros.wait_until(lambda: '/trainer' not in map(
+        topics.node_name, ros.node.get_subscriptions_info_by_topic(TOPIC)))
     (result,) = ros.set_parameters('trainer', output=str(output))
     assert result.successful, result.reason
     response = ros.set_bool('trainer/record', True)
@@ -195,6 +208,67 @@ def test_too_little_room_stops_the_recording_alone(shared: Harness, tmp_path: Pa
     assert str(tmp_path / 'run_2') in again.message
     ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
     assert ros.set_bool('trainer/record', False).success
+
+
+def test_messages_that_find_the_queue_full_are_counted_as_missed(
+        ros: Harness, tmp_path: Path, run_node: RunNode) -> None:
+    bag = tmp_path / 'run.mcap'
+    node = run_node(TrainerNode, {'output': bag})
+    publisher = ros.speak(Temperature, reactor.TEMPERATURE, to='trainer')
+    say(publisher, 1)
+    found = figures(ros, lambda found: found[ON_TOPIC] == '1')
+    assert found['missed messages'] == '0'
+    # the node, which runs in this thread, takes none of them meanwhile
+    say(publisher, recorder.QUEUE_DEPTH + 118, first=1)
+    status = ros.wait_for_status(STATUS, lambda status: status.level == DiagnosticStatus.WARN)
+    assert f'missed 118 messages on {TOPIC}' in status.message
+    figures(ros, lambda found: found['missed messages'] == '118')
+    node.complete()
+    assert values(recorded(bag)) == [0.0, *range(119, recorder.QUEUE_DEPTH + 119)]
+
+
+def test_messages_that_the_middleware_loses_are_counted_as_missed(
+        ros: Harness, tmp_path: Path) -> None:
+    """Of two publishers, whose numbers do not say which of them sent a message."""
+    bag = tmp_path / 'run.mcap'
+    process = ros.start('trainer', {'output': bag})
+    publishers = [ros.speak(Temperature, reactor.TEMPERATURE, BEST_EFFORT, to='trainer')
+                  for _ in range(2)]
+    for publisher in publishers:
+        publisher.publish(temperature(0.0))
+    figures(ros, lambda found: found[ON_TOPIC] == '2')
+    process.send(signal.SIGSTOP)
+    long = temperature(1.0)
+    long.header.frame_id = 'sensor' * 1000
+    for _ in range(3000):
+        for publisher in publishers:
+            publisher.publish(long)
+    process.send(signal.SIGCONT)
+    # after what waited in the buffers of the network
+    ros.meet('trainer')
+    for publisher in publishers:
+        publisher.publish(temperature(2.0))
+    found = figures(
+        ros, lambda found: int(found[ON_TOPIC]) + int(found['missed messages']) == 6004)
+    assert int(found['missed messages']) > 0
+
+
+def test_publishers_that_take_turns_are_not_counted_as_missed(
+        ros: Harness, tmp_path: Path, run_node: RunNode) -> None:
+    node = run_node(TrainerNode, {'output': tmp_path / 'run.mcap'})
+    first = ros.speak(Temperature, reactor.TEMPERATURE, to='trainer')
+    say(first, 5)
+    figures(ros, lambda found: found[ON_TOPIC] == '5')
+    second = ros.speak(Temperature, reactor.TEMPERATURE, to='trainer')
+    for _ in range(10):
+        say(second, 7)
+        say(first, 1)
+    figures(ros, lambda found: found[ON_TOPIC] == '85')
+    ros.node.destroy_publisher(first)
+    say(second, 5)
+    found = figures(ros, lambda found: found[ON_TOPIC] == '90')
+    assert found['missed messages'] == '0'
+    node.complete()
 
 
 def test_bag_that_vanished_is_no_success(shared: Harness, tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from rclpy.duration import Duration
 from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.publisher import Publisher
 from rclpy.task import Future
 from rclpy.utilities import get_rmw_implementation_identifier
 from sensor_msgs.msg import Temperature
@@ -38,6 +39,7 @@ from koopman_ros.ros.controller_messages import active_constraints, planned
 from koopman_ros.ros.controller_status import Counts, statuses
 from koopman_ros.ros.diagnostics import Severity
 from koopman_ros.ros.managed import ManagedNode
+from koopman_ros.ros.missed_messages import MissedMessages
 from koopman_ros.ros.recorder import receipt_ns, Recorder
 from koopman_ros.ros.remote_node import repeated
 from koopman_ros.ros.signals import MeasuredInputs, SignalSample
@@ -110,6 +112,42 @@ def test_batch_is_recorded_in_the_order_of_sending(
     # the times are not those at which the batch was taken
     assert logged[-1] < before
     assert all(m.publish_time_ns <= m.log_time_ns for m in messages)
+
+
+def test_only_gaps_in_the_numbers_of_the_one_publisher_are_missed_messages(ros: Harness) -> None:
+    topic = '/temperature'
+    missed = MissedMessages(ros.node)
+
+    def receive(*numbers: int) -> dict[str, int]:
+        for number in numbers:
+            missed.on_message(topic, {'publication_sequence_number': number})
+        return missed.counts
+
+    def publish(count: int) -> None:
+        # in silence
+        while ros.node.count_publishers(topic) < count:
+            publishers.append(ros.node.create_publisher(Temperature, topic, topics.LOOP_QOS))
+            ros.wait_until(lambda: ros.node.count_publishers(topic) == len(publishers))
+            missed.look_for_publishers(topic)
+
+    def leave_one() -> None:
+        while len(publishers) > 1:
+            ros.node.destroy_publisher(publishers.pop(0))
+            ros.wait_until(lambda: ros.node.count_publishers(topic) == len(publishers))
+            missed.look_for_publishers(topic)
+
+    publishers: list[Publisher] = []
+    publish(1)
+    assert receive(7, 8) == {}
+    assert receive(12, 13) == {topic: 3}
+    publish(3)
+    assert receive(500, 14, 501, 15) == {topic: 3}
+    leave_one()
+    publish(2)
+    leave_one()
+    assert receive(40, 41) == {topic: 3}
+    assert receive(44) == {topic: 5}
+    missed.on_message(topic, {})
 
 
 @pytest.mark.parametrize(('at_take', 'received', 'source', 'found'), [
