@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What holds for all tests: their order, checked messages, threads, disturbed trainings."""
+"""What holds for all tests: order, skips, checked messages, threads, disturbed trainings."""
 
 from collections.abc import Iterator
 import gc
@@ -21,6 +21,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 from koopman_ros.process_entry import SIGNALS
+from support import INSTALL_CHROMIUM
 from support.disturbance import disturb_training
 
 # An int in a float64 field, say, passes unnoticed here, and aborts the process where the message
@@ -57,6 +58,27 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files first, the others in their order."""
     order = {name: place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport() -> Iterator[None]:
+    """Fail a test that skips where all are required: in continuous integration."""
+    report = (yield).get_result()
+    if report.skipped and not hasattr(report, 'wasxfail') and os.environ.get('CI') == 'true':
+        report.outcome = 'failed'
+        report.longrepr = f'skipped, although CI=true requires every test: {report.longrepr[2]}'
+
+
+@pytest.hookimpl(hookwrapper=True, tryfirst=True)
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> Iterator[None]:
+    """Say at the end how many tests a browser would add."""
+    yield
+    skipped = [report for report in terminalreporter.stats.get('skipped', ())
+               if INSTALL_CHROMIUM in str(report.longrepr)]
+    if skipped:
+        terminalreporter.write_line(
+            f'{len(skipped)} tests with a browser were skipped. To run them, install Chromium: '
+            f'{INSTALL_CHROMIUM}')
 
 
 @pytest.fixture(autouse=True)

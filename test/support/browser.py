@@ -11,6 +11,8 @@ import shutil
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 import pytest
 
+from support import INSTALL_CHROMIUM
+
 PATIENCE = 60_000.0  # ms
 ADDRESS = re.compile(r'the panel is at (http://127\.0\.0\.1:\d+)')
 # The address bar has two pages of its own, which each window would load, where there is no bar.
@@ -78,7 +80,7 @@ def opened_browser() -> Iterator[Pages]:
     """Start a browser; the end asserts that no page complained, and none asked others."""
     chromium = shutil.which('chromium')
     if chromium is None:
-        pytest.fail('the tests in a browser need Chromium: sudo apt-get install chromium')
+        pytest.skip(f'needs Chromium: {INSTALL_CHROMIUM}')
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(
             executable_path=chromium, headless=True, args=list(_FLAGS))
