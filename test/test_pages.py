@@ -35,6 +35,7 @@ from koopman_ros.ros.controller_messages import active_constraints
 from koopman_ros.testing import isolated_domain
 from studies import exported_loops, late_reactor
 from studies.records.table import table_of as records_table
+from support.heater_logs import write_heater_logs
 from support.nodes import type_support
 
 __all__ = ['type_support']
@@ -81,19 +82,19 @@ def test_model_of_signals_alone_is_saved_as_the_page_has_it(
     assert load('signals.safetensors').states.names == ('temperature',)
 
 
-@pytest.mark.skipif(not (ROOT.parent / 'shared' / 'records' / 'tclab_hybrid.csv').is_file(),
-                    reason='the record of the heater board is not at hand')
-def test_the_record_of_the_heater_board_is_as_the_page_has_it(
-        monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.chdir(ROOT)
+def test_the_logs_of_the_heater_are_as_the_page_has_them(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+        ) -> None:
+    write_heater_logs(tmp_path / 'out' / 'tutorials')
+    monkeypatch.chdir(tmp_path)
     (block,) = re.findall(r'```python\n(.*?)```',
                           (ROOT / 'docs/tutorials/measured_record.md').read_text(), re.DOTALL)
     names: dict[str, Any] = {}
     exec(block, names)
-    assert 'hybrid' in capsys.readouterr().out
-    first = [names['pd'].read_csv(f'../shared/records/tclab_{log}.csv').iloc[0, 3:].max()
-             for log in ('energy', 'mimo', 'hybrid')]
-    assert min(first[:2]) > 20.0 > first[2]
+    assert 'cold_day' in capsys.readouterr().out
+    first = [names['pd'].read_csv(f'out/tutorials/heater_{day}.csv')['temperature [degC]'][0]
+             for day in ('day_1', 'day_2', 'cold_day')]
+    assert first == pytest.approx([21.0, 21.0, 17.5], abs=0.6)
 
 
 @pytest.mark.parametrize('page', sorted(ROOT.glob('docs/results/*.md')),

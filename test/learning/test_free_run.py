@@ -4,7 +4,6 @@
 """Free runs of models on records, against the exact solution of an oscillator."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,11 +14,11 @@ from koopman_ros.learning.identification import DriftModel, Identified, identify
 from koopman_ros.learning.pipeline import _failed_runs, DRIFT, LINEAR_MODEL
 from koopman_ros.model import Box, Coordinates, linearised_model, Provenance
 from koopman_ros.records import read
+from support.heater_logs import COLD_DAY, DAYS, write_heater_logs
 from support.sampling import sampled
 
 A, B = np.array([[0.0, 1.0], [-1.0, -0.4]]), np.array([[0.0], [1.0]])
 N, PERIOD = 200, 0.1
-RECORDS = Path(__file__).parents[2] / '../shared/records'
 STATES = Coordinates.spanning(('position', 'speed'), ('m', 'm/s'), -2.0 * np.ones(2),
                               2.0 * np.ones(2))
 INPUTS = Coordinates.spanning(('force',), ('N',), -np.ones(1), np.ones(1))
@@ -176,14 +175,12 @@ def test_rejects_a_record_of_other_signals(signals, options, words):
         simulate(lifted(), read(table(), *signals), **options)
 
 
-@pytest.mark.skipif(not RECORDS.is_dir(), reason='the measured records are not here')
-def test_a_linear_model_of_two_heaters_follows_them_on_another_day():
-    signals = ['temperature_1 [K]', 'temperature_2 [K]'], ['heater_1', 'heater_2']
-    days, other = (read([RECORDS / f'tclab_{name}.csv' for name in names], *signals)
-                   for names in (('energy', 'mimo'), ('hybrid',)))
+def test_a_linear_model_of_a_heater_follows_it_on_another_day(tmp_path):
+    write_heater_logs(tmp_path)
+    days, other = (read([tmp_path / name for name in names], 'temperature [K]', 'heater')
+                   for names in (DAYS, (COLD_DAY,)))
     run = simulate(identify(days.plant, days.episodes, degrees=(1,)), other)
-    assert np.all(run.rmse < [4.0, 6.0])
-    # of a motion by 30 K and 20 K
+    # of a motion by tens of kelvin, behind a thermometer whose lag is not in the model
     assert run.fit[0] > 50.0
 
 

@@ -4,7 +4,6 @@
 """Records from tables: columns, units, times, missing values and gaps."""
 
 import os
-from pathlib import Path
 import re
 
 import numpy as np
@@ -13,6 +12,7 @@ import pytest
 from scipy.io import savemat
 
 from koopman_ros.records import read
+from support.heater_logs import DAYS, write_heater_logs
 
 N, PERIOD = 60, 0.5
 SECONDS = PERIOD * np.arange(N)
@@ -21,7 +21,6 @@ PUMP = np.repeat([2.0, 4.0, 3.0], N // 3)
 START = pd.Timestamp('2026-03-01 08:00:00')
 LATE = pd.Timestamp('2026-02-12 23:59:45')
 DST = pd.Timestamp('2026-03-29 01:59:45', tz='Europe/Berlin')
-RECORDS = Path(__file__).parents[2] / '../shared/records'
 
 
 def frame(**columns):
@@ -289,11 +288,9 @@ def test_days_and_months_that_no_date_tells_are_asked_for(dayfirst, step):
     assert f'gap of {gap:.3f} s' in str(record)
 
 
-@pytest.mark.skipif(not RECORDS.is_dir(), reason='the measured records are not here')
-def test_measured_records():
-    record = read([RECORDS / 'tclab_energy.csv', RECORDS / 'tclab_mimo.csv'],
-                  ['temperature_1 [K]', 'temperature_2 [K]'], ['heater_1', 'heater_2'])
-    assert list(map(len, record.episodes)) == [599, 201]
-    assert record.plant.input_units == ('percent', 'percent')
-    tanks = read(RECORDS / 'cascaded_tanks.csv', 'level = yEst [V]', 'pump = uEst [V]', period=4.0)
-    assert tanks.episodes[0].time[-1] == 4.0 * 1023
+def test_logs_of_a_device(tmp_path):
+    write_heater_logs(tmp_path)
+    record = read([tmp_path / name for name in DAYS], 'temperature [K]', 'heater')
+    assert list(map(len, record.episodes)) == [600, 600]
+    assert record.plant.input_units == ('percent',)
+    assert record.episodes[0].x[0, 0] == pytest.approx(294.15, abs=0.5)
