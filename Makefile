@@ -5,6 +5,8 @@ BIN := $(VENV)/bin
 # All versions are locked, also those of the build tools (two names, for older and newer pip).
 LOCK := requirements.lock
 INSTALL := PIP_CONSTRAINT=$(LOCK) PIP_BUILD_CONSTRAINT=$(LOCK) $(BIN)/python -m pip install --quiet
+# SysIdentPy asks for an older NumPy than the other packages, and works with this one.
+SYSIDENTPY := $(BIN)/python -m pip install --quiet --no-deps sysidentpy==0.9.0
 # With this variable set, Python caches no byte code, and every process compiles the package again.
 unexport PYTHONDONTWRITEBYTECODE
 # Use the packages of .venv, ROS 2 included, not those of a sourced ROS 2.
@@ -15,7 +17,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help learn demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-late studies-general studies-unstable studies-saddle studies-partial studies-records studies-export bench faults docs panel-pictures config lock clean
+.PHONY: help learn demo demo-retrain demo-saddle walkthrough test test-machines lint models studies studies-sensors studies-robustness studies-late studies-general studies-unstable studies-saddle studies-partial studies-records studies-export bench faults docs panel-pictures config lock clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -33,6 +35,7 @@ $(VENV)/run.stamp: setup.py $(LOCK) | $(BIN)/python
 
 $(VENV)/test.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,learn,test,bench]'
+	$(SYSIDENTPY)
 	@touch $@
 
 $(VENV)/train.stamp: setup.py $(LOCK) | $(BIN)/python
@@ -68,6 +71,9 @@ demo-retrain: $(VENV)/retrain.stamp  ## retrain the model of a plant that change
 demo-saddle: SEEDS = 5
 demo-saddle: $(VENV)/bench.stamp  ## train on an unstable reactor under PI control, temperature measured only, and stabilise it; SEEDS=5, 15 min -> out/demo-saddle
 	$(BIN)/python -m studies.saddle_act --seeds $(SEEDS)
+
+walkthrough:  ## run the commands of README and tutorials, each in a clone of its own, 30 min
+	$(PYTHON) test/walkthrough.py
 
 # Types are checked in parallel with the tests. Tests with processes mostly wait, so there are two more
 # workers than cores; the longest files come first (test/conftest.py). A killed worker is not replaced:
@@ -122,14 +128,13 @@ studies-partial: SEEDS = 10
 studies-partial: $(VENV)/bench.stamp  ## comparison with do-mpc and LQG on three partly measured plants, SEEDS=10, 5 min -> out/studies-partial
 	$(BIN)/python -m studies.partly_measured --seeds $(SEEDS)
 
-# SysIdentPy asks for an older NumPy than the other packages, and works with this one.
 $(VENV)/records.stamp: setup.py $(LOCK) $(VENV)/bench.stamp
 	$(INSTALL) --editable '.[learn,bench]'
-	$(BIN)/python -m pip install --quiet --no-deps sysidentpy==0.9.0
+	$(SYSIDENTPY)
 	@touch $@
 
 studies-records: SEEDS = 3
-studies-records: RECORDS = ../shared/records
+studies-records: RECORDS = records
 studies-records: $(VENV)/records.stamp  ## learning from measured records, compared with ARX, N4SID, NARX and EDMDc; RECORDS=folder, SEEDS=3, 30 min -> out/studies-records
 	$(BIN)/python -m studies.records --records $(RECORDS) --seeds $(SEEDS)
 
