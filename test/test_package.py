@@ -20,6 +20,7 @@ import pytest
 import yaml
 
 import koopman_ros
+from support.distributions import installed_with, loaded, modules_without, providers
 
 ROOT = Path(__file__).parent.parent
 SOURCES = sorted([ROOT / 'setup.py', *(
@@ -70,7 +71,9 @@ def test_versions_agree_and_the_manifest_is_of_format_3_and_names_real_people() 
     setup = re.search(r"version='([^']+)'", (ROOT / 'setup.py').read_text())
     assert setup is not None
     assert manifest.findtext('version') == koopman_ros.__version__ == setup.group(1)
-    assert f'\n{koopman_ros.__version__} ' in (ROOT / 'CHANGELOG.rst').read_text()
+    # as ROS tools read it: changes that are not released yet are first
+    assert re.search(r'^(Forthcoming|\d+\.\d+\.\d+ \(\d{4}-\d{2}-\d{2}\))\n-+$',
+                     (ROOT / 'CHANGELOG.rst').read_text(), re.MULTILINE)
     assert manifest.get('format') == '3'
     assert manifest.findtext('name') == 'koopman_ros'
     assert manifest.findtext('export/build_type') == 'ament_python'
@@ -92,7 +95,7 @@ def _keys() -> dict[str, dict[str, list[str]]]:
 
 def _third_party(*folders: str) -> set[str]:
     """Return the modules of other distributions that the files in folders import."""
-    own = {'koopman_ros', 'studies', 'benchmarks', 'support', 'machines'}
+    own = {'koopman_ros', 'studies', 'benchmarks', 'support', 'machines', 'walkthrough'}
     return {name.split('.')[0] for folder in folders for path in ROOT.glob(f'{folder}/**/*.py')
             for name in _names(path)[0]} - own - sys.stdlib_module_names
 
@@ -135,6 +138,32 @@ def test_rosdep_has_every_key_of_the_manifest_and_the_page_names_the_rest() -> N
     assert not [key for key in keys['pip'] if f'`{key}`' not in install]
     assert not [name for name in keys['none'] if not re.search(rf'install[^`]*\b{name}', install)
                 and f'python3-{name}' not in install]
+
+
+@pytest.mark.filterwarnings('ignore::DeprecationWarning')
+@pytest.mark.parametrize(('control_only', 'modules'), [
+    (False, 'plant controller trainer player replay'), (True, 'plant controller trainer')])
+def test_nodes_import_with_the_packages_of_the_page_alone(control_only: bool, modules: str
+                                                          ) -> None:
+    """Where control_only, without what the page leaves out then."""
+    keys = _keys()
+    manifest = parse_package(ROOT / 'package.xml')
+    manifest.evaluate_conditions({'KOOPMAN_ROS_CONTROL_ONLY': '1'} if control_only else {})
+    modules_of = {**keys['ros'], **keys['apt'], **keys['pip']}
+    named = {name for one in manifest.exec_depends if one.evaluated_condition
+             for name in modules_of[one.name]}
+    page = (ROOT / 'docs' / 'how-to' / 'install.md').read_text()
+    (commands, *_) = re.findall(r'```sh\n(.*?)```', page, re.DOTALL)
+    named |= set(re.findall(r'python3-(\w+)', commands))
+    named |= {name for line in re.findall(r'^pip install(.*)$', commands, re.MULTILINE)
+              for name in line.split() if not name.startswith('-')}
+    if control_only:
+        named -= {'cloudpickle'}
+    there = installed_with(*(name for module in named for name in providers().get(module, ())))
+    nodes = [f'koopman_ros.nodes.{name}' for name in modules.split()]
+    learning = [] if control_only else ['koopman_ros.learning', 'koopman_ros.execution.pools']
+    assert set(nodes) <= loaded(
+        ', '.join([*nodes, *learning]), modules_without({*there, 'koopman-ros'}))
 
 
 @pytest.mark.parametrize('manifest', ['package.xml', 'examples/oven/package.xml'])

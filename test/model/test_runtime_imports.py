@@ -3,23 +3,7 @@
 
 """What the run-time packages import, checked in a process that has nothing loaded."""
 
-from pathlib import Path
-import subprocess
-import sys
-
-import koopman_ros
-
-
-def loaded(modules: str, absent: tuple[str, ...] = ()) -> set[str]:
-    """Import modules where some packages are not installed; return all that were loaded."""
-    # None in its place makes the import of a module fail
-    program = (f'import sys; sys.modules.update(dict.fromkeys({absent!r}))\n'
-               f'import {modules}\nprint(*(name for name in sys.modules if sys.modules[name]))')
-    result = subprocess.run(
-        [sys.executable, '-W', 'error', '-c', program], capture_output=True, text=True,
-        timeout=240, check=False, cwd=Path(koopman_ros.__file__).parents[1])
-    assert (result.returncode, result.stderr) == (0, '')
-    return set(result.stdout.split())
+from support.distributions import loaded
 
 
 def test_runtime_needs_neither_ros_nor_torch() -> None:

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from functools import cache
 from importlib.metadata import distribution, PackageNotFoundError, packages_distributions
 from pathlib import Path
+import subprocess
 import sys
 
 from packaging.requirements import Requirement
@@ -49,6 +50,18 @@ def modules_without(distributions: Iterable[str]) -> set[str]:
     """Return the modules installed here that none of the distributions provides."""
     there = set(distributions)
     return {module for module, names in providers().items() if not names & there}
+
+
+def loaded(modules: str, absent: Iterable[str] = ()) -> set[str]:
+    """Import modules where some packages are not installed; return all that were loaded."""
+    # None in its place makes the import of a module fail
+    program = (f'import sys; sys.modules.update(dict.fromkeys({tuple(absent)!r}))\n'
+               f'import {modules}\nprint(*(name for name in sys.modules if sys.modules[name]))')
+    result = subprocess.run(
+        [sys.executable, '-W', 'error', '-c', program], capture_output=True, text=True,
+        timeout=240, check=False, cwd=ROOT)
+    assert (result.returncode, result.stderr) == (0, ''), result.stderr
+    return set(result.stdout.split())
 
 
 def imports_of(*modules: str) -> dict[str, str]:
