@@ -16,9 +16,10 @@ from koopman_ros.control.events import (
     Silence,
 )
 from koopman_ros.control.laws import averaged, Feedback, feedback, Form, LAWS, recentred, Weights
-from koopman_ros.control.laws.base import steady_state_target, Target
+from koopman_ros.control.laws.base import Target
 from koopman_ros.control.setpoint import Setpoint
 from koopman_ros.control.state import Arrival, Mode, State, StepReport
+from koopman_ros.control.steady_state import steady_state_target
 from koopman_ros.control.supervisor import HOLD, MANUAL, SAFE, Supervisor
 from koopman_ros.tuning import InputLimits, SensorLimits, Tuning
 

@@ -84,8 +84,7 @@ class Controller(ControlStep):
         try:
             with np.errstate(all='ignore'):
                 rejection = self._feasibility(state).infeasibility(
-                    goal, (state.setpoint.requested, state.setpoint.active), state.command,
-                    len(asked) == len(every))
+                    goal, np.isfinite(whole))
                 if rejection is None:
                     return state._replace(setpoint=self._with_room(state, requested)), None
         except BaseException as error:

@@ -14,7 +14,6 @@ import numpy as np
 
 from koopman_ros.control.fallback import FallbackLevel
 from koopman_ros.control.state import State
-from koopman_ros.control.steady_state import held_at
 from koopman_ros.control.supervisor import Supervisor
 from koopman_ros.control.timing import StepTime
 from koopman_ros.core.arrays import all_finite, Array
@@ -35,6 +34,7 @@ from koopman_ros.estimation import (
     with_applied,
 )
 from koopman_ros.model import LiftedModel
+from koopman_ros.model.steady_state import held_at
 from koopman_ros.tuning import Tuning
 
 
@@ -217,7 +217,11 @@ class StateEstimation:
 
     def _beyond(self, outside: float) -> bool:
         """Whether no law acts at a distance from the training data."""
-        return outside > max(level.law.margin for level in self.levels.values())
+        return outside > self._farthest
+
+    @cached_property
+    def _farthest(self) -> float:
+        return max(level.law.margin for level in self.levels.values())
 
     def position(self, known: Estimate | None, y: Array) -> Array:
         """
@@ -236,7 +240,8 @@ class StateEstimation:
         """Return the steady state with the outputs of a state (n_x,), or that state."""
         measured = np.any(self.outputs.C != 0.0, axis=0)
         if np.count_nonzero(measured) == len(self.outputs.C) and np.isfinite(x).all():
-            found = held_at(self.model, self.model.states.to_deviation(x), measured)
+            found = held_at(
+                self.model, self.model.states.to_deviation(x), measured, self._farthest)
             if found is not None:
                 return self.model.states.to_physical(found)
         return x

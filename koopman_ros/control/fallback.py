@@ -24,10 +24,9 @@ from koopman_ros.control.laws.base import (
     LawResult,
     Plan,
     SolutionInfo,
-    steady_state_target,
     Target,
 )
-from koopman_ros.control.steady_state import partial_target, reachable_target
+from koopman_ros.control.steady_state import steady_state_target
 from koopman_ros.core.arrays import all_finite, Array, differ
 from koopman_ros.core.plugins import contained, plug_in
 from koopman_ros.core.signals import numbers, Outputs
@@ -90,13 +89,20 @@ class FallbackLevel:
         return self.model.states.only(self.controlled)
 
     @cached_property
-    def _indices(self) -> NDArray[np.intp]:
+    def indices(self) -> NDArray[np.intp]:
+        """Indices (n_c,) of the states with a set-point."""
         return np.array([self.model.states.names.index(name) for name in self.controlled],
                         dtype=np.intp)
 
+    @cached_property
+    def input_range(self) -> tuple[Array, Array]:
+        """Lower and upper ends (n_u,) of the inputs, in scaled deviations."""
+        inputs = self.model.inputs
+        return inputs.to_deviation(self.limits.lower), inputs.to_deviation(self.limits.upper)
+
     def controlled_of(self, x: Array) -> Array:
         """Return the part (n_c,) of a state (n_x,) that has a set-point."""
-        return x[self._indices]
+        return x[self.indices]
 
     def target(self, setpoint: Array, w: Array, start: Array | None) -> Target | None:
         """
@@ -110,15 +116,12 @@ class FallbackLevel:
         goal = self.controlled_states.to_deviation(setpoint)
         if self.law.model_free:
             x = np.zeros(n)
-            x[self._indices] = goal
+            x[self.indices] = goal
             return Target(x, np.zeros(model.n_u), np.zeros(n), 0.0)
-        if self.controls_all:
-            return steady_state_target(model, goal, w)
-        y = np.zeros(n + model.n_u) if start is None else np.concatenate(
-            (model.states.to_deviation(start[:n]), inputs.to_deviation(start[n:])))
-        return partial_target(
-            model, self._indices, goal, w, inputs.to_deviation(self.limits.lower),
-            inputs.to_deviation(self.limits.upper), y)
+        return steady_state_target(
+            model, goal, w, controlled=self.indices, limits=self.input_range,
+            start=None if start is None else np.concatenate((
+                model.states.to_deviation(start[:n]), inputs.to_deviation(start[n:]))))
 
     def compute(self, setpoint: Array, estimate: Estimate, memory: object, interval: float,
                 start: Array | None, previous: Array | None, pending: PendingInputs | None = None,
@@ -139,12 +142,11 @@ class FallbackLevel:
             target = self.target(setpoint, estimate.w, start)
             if target is None:
                 return None, LawResult(None, reason(StatusCode.NO_STEADY_STATE))
-            target = self._within_reach(target, estimate.w)
             horizon = self.law.horizon(interval) if interval > 0.0 else 0.0
             if ahead is not None and horizon > 0.0:
                 horizon += max(pending.dead_ns) / NANOSECONDS if pending else 0.0
                 target = replace(target, later=tuple(
-                    (seconds, self._within_reach(found, estimate.w))
+                    (seconds, found)
                     for seconds, later in ahead(horizon)
                     if (found := self.target(later, estimate.w, start)) is not None))
             if pending is not None and any(pending.dead_ns) and pending.applied.values:
@@ -250,19 +252,6 @@ class FallbackLevel:
         for j, i in self.model.commanded.items():
             u[j] = now[i] - math.expm1(-seconds / self.model.lag[j]) * (u[j] - now[i])
         return u
-
-    def _within_reach(self, target: Target, w: Array) -> Target:
-        """Return the target, or the nearest one where the inputs do not suffice."""
-        model, limits = self.model, self.limits
-        # a single one at its end goes there by itself
-        if self.law.model_free or model.n_u == 1 or len(self.controlled) > model.n_u:
-            return target
-        u = model.inputs.to_physical(target.u)
-        if ((u >= limits.lower) & (u <= limits.upper)).all():
-            return target
-        return reachable_target(
-            model, self._indices, target, w, model.inputs.to_deviation(limits.lower),
-            model.inputs.to_deviation(limits.upper)) or target
 
 
 def build_levels(model: LiftedModel, outputs: Outputs, tuning: Tuning) -> dict[str, FallbackLevel]:

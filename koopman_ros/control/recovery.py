@@ -13,6 +13,7 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.solvers import decaying
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.model import LiftedModel
+from koopman_ros.model.steady_state import resting_state
 
 # The input is ahead of the plant by this share of the way from the safe input to the nominal
 # one; a frozen sensor moves it no further.
@@ -21,10 +22,6 @@ _LEAD = 0.25
 _MOVED = 0.03
 # A state is at rest if it has not moved for so many times the recovery time.
 _REST = 3.0
-# A model is followed in steps of this share of its box and of the time in which its rate changes,
-# until less than a share of the box is left of its way.
-_STEP, _STEP_SHARE, _AT_REST = 0.02, 0.2, 1e-5
-_MAX_STEPS = 500
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,50 +89,40 @@ class RestState:
     holding: Array | None = None
 
 
-def rest_under(model: LiftedModel, u: Array, known: float) -> RestState:
+def rest_under(model: LiftedModel, u: Array, known: float, *, halvings: int = 20) -> RestState:
     """
-    Follow the model from its nominal state under an input until it rests, or is too far out.
+    Find where an input leads the model from its nominal state, by the steady states on the way.
 
     :param u: (n_u,) in input units.
-    :param known: distance outside the training data, in half-ranges, up to which it is followed.
+    :param known: distance outside the training data, in half-ranges, up to which the model holds.
+    :param halvings: of the way from the nominal input, to the last one that keeps it there.
     """
+    v = model.inputs.to_deviation(u)
+    reached, beyond, x = 0.0, 1.0, np.zeros(model.n_x)
     try:
         with np.errstate(all='ignore'):
-            return _followed(model, u, known)
+            share = 1.0
+            for _ in range(1 + halvings):
+                found = resting_state(model, share * v, 0.0, x)
+                if found is not None and model.distance(model.states.to_physical(found)) <= known:
+                    reached, x = share, found
+                    if share == 1.0:
+                        place = model.states.to_physical(x)
+                        return RestState(place, model.distance(place))
+                else:
+                    beyond = share
+                share = 0.5 * (reached + beyond)
+            return _beyond(model, x, v, reached)
     except np.linalg.LinAlgError:
         # a model that gives no finite numbers also fails in the loop
         return RestState(np.full(model.n_x, np.nan), np.nan)
 
 
-def _followed(model: LiftedModel, u: Array, known: float) -> RestState:
-    v = model.inputs.to_deviation(u)
-    rate_at = model.rate_under(v)
-    x = np.zeros(model.n_x)
-    rate = rate_at(x)
-    # of the deviations: steps of a fraction of the box, and of the time in which the rate changes
-    width = float(np.min((model.states.upper - model.states.lower) / model.states.scale))
-    time = np.inf
-    for _ in range(_MAX_STEPS):
-        speed = float(np.linalg.norm(rate))
-        if speed == 0.0 or speed * time < _AT_REST * width:
-            break
-        before, rate_before = x, rate
-        x = x + min(_STEP * width / speed, _STEP_SHARE * time) * rate
-        rate = rate_at(x)
-        if not model.distance(model.states.to_physical(x)) <= known:
-            return _beyond(model, x, v, rate)
-        change = float(np.linalg.norm(rate - rate_before))
-        time = float(np.linalg.norm(x - before)) / change if change > 0.0 else np.inf
-    place = model.states.to_physical(x)
-    return RestState(place, model.distance(place))
-
-
-def _beyond(model: LiftedModel, x: Array, u: Array, rate: Array) -> RestState:
-    """Extrapolate from a state (n_x,) moving at a rate (n_x,) under (n_u,), all scaled."""
+def _beyond(model: LiftedModel, x: Array, u: Array, reached: float) -> RestState:
+    """Extrapolate from a state (n_x,) held by a share of an input (n_u,), all scaled."""
     slope = model.drift_jacobian(x) + model.forcing_jacobian(x, u)
     place, outside = np.full(model.n_x, np.nan), np.nan
     if np.all(np.isfinite(slope)) and decaying(np.linalg.eigvals(slope)).all():
-        place = model.states.to_physical(x - np.linalg.solve(slope, rate))
+        place = model.states.to_physical(x - np.linalg.solve(slope, model.rate_under(u)(x)))
         outside = model.distance(place)
-    return RestState(place, outside, model.inputs.to_physical(
-        -model.input_inverse(x) @ model.drift(x)))
+    return RestState(place, outside, model.inputs.to_physical(reached * u))

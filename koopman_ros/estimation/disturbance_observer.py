@@ -10,11 +10,10 @@ import numpy as np
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.signals import Outputs
+from koopman_ros.core.steady_state import steady_state
 from koopman_ros.estimation.base import Estimate, Estimator, LOST, predicted_state
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
-
-_CONVERGED = 1e-9  # of scaled deviations; the figure is shown with nine digits
 
 
 def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
@@ -107,19 +106,9 @@ def equivalent_bias(model: LiftedModel, estimate: Estimate) -> Array:
 
     :return: (n_x,) in scaled deviations.
     """
-    wanted = model.drift(estimate.x) + estimate.w
-    bias = np.zeros_like(estimate.x)
+    x, lost = estimate.x, LOST * model.states.half_widths
+    wanted = model.drift(x) + estimate.w
     with np.errstate(all='ignore'):
-        for _ in range(20):
-            x = estimate.x - bias
-            try:
-                step = np.linalg.solve(model.drift_jacobian(x), model.drift(x) - wanted)
-            except np.linalg.LinAlgError:
-                break
-            bias = bias + step
-            # steps shrink by their square: the next one would be below rounding
-            if not np.all(np.abs(bias) < 1e3) or np.all(np.abs(step) < _CONVERGED):
-                break
-        solved = np.all(np.abs(bias) < 1e3) and np.allclose(
-            model.drift(estimate.x - bias), wanted, rtol=0.0, atol=1e-6)
-    return bias if solved else np.full_like(bias, np.nan)
+        found = steady_state(lambda y: model.drift(y) - wanted, model.drift_jacobian, x,
+                             np.minimum(x, -lost), np.maximum(x, lost), anchor=x)
+    return np.full_like(x, np.nan) if found is None else x - found

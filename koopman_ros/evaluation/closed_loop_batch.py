@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from koopman_ros.control.fallback import FallbackLevel
 from koopman_ros.control.laws import Law, Linear, Weights
-from koopman_ros.control.laws.base import steady_state_target
+from koopman_ros.control.laws.base import Target
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.integration import integrate
 from koopman_ros.core.signals import Outputs
@@ -219,7 +219,7 @@ def _constant(law: Linear, setpoints: Array, inputs: Array, seconds: float) -> _
     free = Linear(model, replace(law.tuning, limits=InputLimits(-endless, endless, endless)), None)
     gain = np.full((model.n_u, n), np.nan)
     with contextlib.suppress(np.linalg.LinAlgError):
-        target = steady_state_target(model, np.zeros(n))
+        target = Target.at(model, np.zeros(n + model.n_u))
         for k, x in enumerate(np.eye(n)):
             u = free.compute(Estimate(x, np.zeros(n)), target, None, seconds, None).u
             if u is not None:

@@ -13,6 +13,7 @@ import numpy as np
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.integration import integrate
 from koopman_ros.core.solvers import solve_riccati
+from koopman_ros.core.steady_state import Goal, steady_state
 from koopman_ros.plants.system import ControlAffineSystem
 
 _MAX_ITERATIONS = 200
@@ -63,12 +64,14 @@ def linear_law(task: Task) -> OptimalTrajectory:
     system = task.system
     A, weighted = system.slope(system.nominal_state, system.nominal_input), task.Q > 0.0
     B = system.input_matrix(system.nominal_state)
-    C = np.eye(system.n_x)[weighted]
-    # in units of the states, which matter where no input holds them all
-    unit = np.concatenate([system.state_scale, system.state_scale[weighted]])
-    held_so = np.block([[A, B], [C, np.zeros((len(C), system.n_u))]]) / unit[:, None]
-    offset = np.concatenate([np.zeros(system.n_x), C @ (task.x_ref - system.nominal_state)])
-    x, u = np.split(np.linalg.lstsq(held_so, offset / unit, rcond=None)[0], [system.n_x])
+    n, unit = system.n_x, np.concatenate([system.state_scale, np.where(
+        system.nominal_input != 0.0, np.abs(system.nominal_input), 1.0)])
+    J = np.hstack([A, B]) * unit / unit[:n, None]
+    endless, places = np.full(len(unit), np.inf), np.flatnonzero(weighted)
+    y = steady_state(lambda y: J @ y, lambda y: J, np.zeros(len(unit)), -endless, endless, Goal(
+        places, ((task.x_ref - system.nominal_state) / unit[:n])[places]))
+    assert y is not None  # the nominal point is one
+    x, u = np.split(y * unit, [n])
     K = solve_riccati(A, B, np.diag(task.Q), np.diag(task.R)).K
     return _constant_law(task, system.nominal_input + u, K, system.nominal_state + x)
 

@@ -12,10 +12,11 @@ import numpy as np
 
 from koopman_ros.control.controller import Controller
 from koopman_ros.control.events import apply, Event, Measurement, Silence
+from koopman_ros.control.feasibility import FeasibilitySettings
 from koopman_ros.control.laws import Feedback, feedback, Weights
-from koopman_ros.control.laws.base import steady_state_target, Target
+from koopman_ros.control.laws.base import Target
 from koopman_ros.control.state import State, StepReport
-from koopman_ros.control.steady_state import nearest_steady_state, partial_target
+from koopman_ros.control.steady_state import steady_state_target
 from koopman_ros.core.arrays import Array, frozen, short_repr
 from koopman_ros.core.signals import per_signal
 from koopman_ros.core.status import reason, StatusFormatter
@@ -246,7 +247,8 @@ class _Failed(Exception):  # noqa: N818
     """The loop cannot continue; the message says why."""
 
 
-# A set-point for all states is held where a steady state is so near, in half-ranges of the box.
+# With fewer inputs than controlled states a set-point is held where a steady state is so near, in
+# half-ranges of the box.
 _NEAR = 0.1
 
 
@@ -261,26 +263,18 @@ def _target(model: LiftedModel, setpoint: Array, controlled: tuple[str, ...]) ->
             raise ValueError(f'{name} = {value:.6g} {unit} is outside the trained range '
                              f'{lower:.6g} {unit} to {upper:.6g} {unit}: choose a set-point '
                              'inside it, or a model trained over a wider range')
-    if not controlled:
-        target = steady_state_target(model, states.to_deviation(setpoint))
-        nearest = target.x if model.n_u >= model.n_x else (
-            nearest_steady_state(model, target, np.zeros(model.n_x)))
-        if nearest is None or not np.all(np.abs(nearest - target.x) * states.scale
-                                         <= _NEAR * 0.5 * (states.upper - states.lower)):
-            where = '' if nearest is None else (
-                f'; the nearest steady state is {states.to_physical(nearest).tolist()}')
-            raise ValueError(f'no input of the model holds {", ".join(states.names)} at '
-                             f'{setpoint.tolist()}{where}: choose another set-point, or list in '
-                             'controlled the states that have one')
-        return target
-    endless = np.full(model.n_u, np.inf)
-    found = partial_target(
-        model, np.array([model.states.names.index(name) for name in controlled], dtype=np.intp),
-        model.states.only(controlled).to_deviation(setpoint), np.zeros(model.n_x), -endless,
-        endless, np.zeros(model.n_x + model.n_u))
-    if found is None:
-        raise ValueError(f'the model has no steady state with {", ".join(controlled)} at '
-                         f'{setpoint.tolist()}: choose another set-point')
+    places = np.array([states.names.index(name) for name in box.names], dtype=np.intp)
+    wanted = box.to_deviation(setpoint)
+    found = steady_state_target(model, wanted, controlled=places)
+    near = FeasibilitySettings().rounding if len(places) <= model.n_u else _NEAR
+    if found is None or not np.all(
+            np.abs(found.x[places] - wanted) <= near * states.half_widths[places]):
+        where = '' if found is None else (
+            f'; the nearest steady state is {states.to_physical(found.x).tolist()}')
+        raise ValueError(f'no input of the model holds {", ".join(box.names)} at '
+                         f'{setpoint.tolist()}{where}: choose another set-point' + (
+                             '' if controlled else ', or list in controlled the states that have '
+                                                   'one'))
     return found
 
 

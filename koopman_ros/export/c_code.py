@@ -10,7 +10,7 @@ CasADi.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass
 from importlib.resources import files
 import math
 from pathlib import Path
@@ -25,6 +25,7 @@ from koopman_ros.control import Controller
 from koopman_ros.control.laws.riccati import closed
 from koopman_ros.core.integration import STEPS
 from koopman_ros.core.status import StatusCode
+from koopman_ros.core.steady_state import SteadyStateSettings
 from koopman_ros.estimation import DisturbanceObserver, ExtendedKalmanFilter, MeasuredState
 from koopman_ros.model import NetworkObservables, PolynomialObservables
 from koopman_ros.model.lifted_model import NODES, WEIGHTS
@@ -184,7 +185,7 @@ def _tables(controller: Controller, interval: float) -> dict[str, Any]:
         'ND': len(model.disturbances), 'NP': 2 * n if kalman else 1, 'NXU': n + m,
         'WIDTH': 1 + 2 * n if kalman else 1, 'N_PSI': psi.shape[1], 'N_PHI': psi.shape[1] - n,
         'LAWS': len(controller.levels), 'QUEUE': math.ceil(max(dead) / 1e9 / interval) + 2,
-        'MOST': max(max(order, m, n_y, 2 * n * kalman) ** 2, order * m, n * max(
+        'MOST': max(max(order, n + m, n_y, 2 * n * kalman) ** 2, order * m, n * max(
             n + m, model.n_z, len(model.disturbances), 2 * n_y, 1 + 2 * n * kalman)),
         'NETWORK': network, 'READ_OUT': model.readout is not None, 'CLOSED': closed(model),
         'KALMAN': kalman, 'DETERMINED': outputs.determine_state, 'CONTROLS_ALL': best.controls_all,
@@ -202,6 +203,8 @@ def _tables(controller: Controller, interval: float) -> dict[str, Any]:
             'FARTHEST': np.sqrt(estimator._lost)} if kalman else
            {**dict.fromkeys(('H_OUTPUT', 'NOISE', 'INTENSITY', 'FIRST_COVARIANCE'), none),
             'ONTO_DISTURBANCES': np.eye(n), 'FARTHEST': 10.0 * model.states.half_widths}),
+        **{f'STEADY_{name}'.upper(): value
+           for name, value in asdict(SteadyStateSettings()).items()},
         'HALF_WIDTH': model.states.half_widths, 'CORNERS': model.states.corners,
         'LOWER_V': model.inputs.to_deviation(tuning.limits.lower),
         'UPPER_V': model.inputs.to_deviation(tuning.limits.upper),

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from koopman_ros.core.arrays import Array, frozen, short_repr
 from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.solvers import differences
+from koopman_ros.core.steady_state import steady_state as find_steady_state
 from koopman_ros.core.units import check_time_unit, checked_signals, SECONDS_PER_TIME_UNIT
 
 ArrayFunction = Callable[[Array], Array]
@@ -22,7 +23,6 @@ ArrayFunction = Callable[[Array], Array]
 _JACOBIAN_TOLERANCE = 1e-4
 _NEARBY = (0.01, 0.02)
 _UNDERFLOW = 1e-12  # a change of a rate that differences lose
-_NEWTON_STEPS = 50  # which are quick, and more than a plant near its nominal point needs
 
 
 def checked_vector(name: str, value: ArrayLike, length: int, *, finite: bool = True) -> Array:
@@ -247,7 +247,7 @@ def steady_state(system: ControlAffineSystem, wanted: Mapping[str, float]
     """
     Find the state (n_x,) and the input (n_u,) that hold some states at values, given by name.
 
-    Newton's method from the nominal point, by least norm where values leave a choice.
+    Where the values leave a choice it is the steady state nearest to the nominal point.
 
     :raises ValueError: for a name that is not a state.
     :raises EquilibriumError: when no input holds them.
@@ -256,13 +256,25 @@ def steady_state(system: ControlAffineSystem, wanted: Mapping[str, float]
         raise ValueError(f'{min(unknown)} is not a state of {system.name}: choose from '
                          f'{", ".join(system.state_names)}')
     held = np.array([name in wanted for name in system.state_names])
-    x, u = system.nominal_state.copy(), system.nominal_input
+    n, x = system.n_x, system.nominal_state.copy()
     x[held] = [wanted[name] for name in system.state_names if name in wanted]
-    others = np.eye(system.n_x)[:, ~held]
-    for _ in range(_NEWTON_STEPS):
-        slope = np.hstack([system.slope(x, u) @ others, system.input_matrix(x)])
-        change = np.linalg.lstsq(slope, -system.derivative(x, u), rcond=None)[0]
-        x = x + others @ change[:others.shape[1]]
-        u = u + change[others.shape[1]:]
+    unit = np.concatenate([system.state_scale, np.where(
+        system.nominal_input != 0.0, np.abs(system.nominal_input), 1.0)])
+    endless = np.full(system.n_u, np.inf)
+    lower, upper = (
+        np.concatenate([np.where(held, x, end), sign * endless]) / unit
+        for sign, end in ((-1.0, system.state_lower), (1.0, system.state_upper)))
+    y = np.concatenate([x, system.nominal_input]) / unit
+
+    def slope(y: Array) -> Array:
+        x, u = np.split(y * unit, [n])
+        return np.hstack([system.slope(x, u), system.input_matrix(x)]) * unit / unit[:n, None]
+
+    found = find_steady_state(
+        lambda y: system.derivative(*np.split(y * unit, [n])) / unit[:n], slope, y, lower, upper,
+        anchor=y)
+    if found is None:
+        return x, equilibrium_input(system, x)
+    x, u = np.where(held, x, (found * unit)[:n]), (found * unit)[n:]
     equilibrium_input(system, x)
     return x, u

@@ -74,6 +74,7 @@ def close_loop(model: LiftedModel) -> ClosedLoop:
 def feed_forward_offset(model: LiftedModel) -> float:
     """Return where the reactor settles under the model's steady-state coolant alone, in K."""
     target = steady_state_target(model, model.states.to_deviation(np.array([SETPOINT])))
+    assert target is not None
     coolant = model.inputs.to_physical(target.u)
     end = solve_ivp(lambda _, x: SYSTEM.derivative(x, coolant), (0.0, 60.0), [START],
                     method='DOP853', rtol=1e-10, atol=1e-10).y[0, -1]

@@ -12,7 +12,7 @@ import numpy as np
 from koopman_ros.control import InputLimits, Tuning
 from koopman_ros.control.laws.base import Target
 from koopman_ros.control.mpc import MPCParameters
-from koopman_ros.control.steady_state import partial_target
+from koopman_ros.control.steady_state import steady_state_target
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.signals import Outputs
@@ -151,11 +151,10 @@ class PartialCase:
         """Return the state and the input that hold a set-point (n_c,) under rates w (n_x,)."""
         model = self.truth
         states, inputs, names = model.states, model.inputs, tuple(self.setpoint)
-        found: Target | None = partial_target(
-            model, np.array([states.names.index(name) for name in names], dtype=np.intp),
-            states.only(names).to_deviation(setpoint),
-            w / states.scale, inputs.to_deviation(self.lower), inputs.to_deviation(self.upper),
-            np.zeros(model.n_x + model.n_u))
+        found: Target | None = steady_state_target(
+            model, states.only(names).to_deviation(setpoint), w / states.scale,
+            controlled=np.array([states.names.index(name) for name in names], dtype=np.intp),
+            limits=(inputs.to_deviation(self.lower), inputs.to_deviation(self.upper)))
         if found is None:
             raise ValueError(f'{self.plant}: nothing holds the set-point under {w.tolist()}')
         return states.to_physical(found.x), inputs.to_physical(found.u)

@@ -12,7 +12,7 @@ from scipy.linalg import solve_continuous_are
 
 from koopman_ros.control import Controller, State, Tuning
 from koopman_ros.control.laws import averaged, feedback, Form, LAWS, recentred, riccati, Weights
-from koopman_ros.control.laws.base import steady_state_target
+from koopman_ros.control.steady_state import steady_state_target
 from koopman_ros.core.integration import runge_kutta_step
 from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.core.status import StatusCode
@@ -68,13 +68,16 @@ def saddle_model():
         system.time_unit, Provenance(system.name))
 
 
-def test_a_state_that_no_input_holds_is_measured():
+def test_the_target_of_a_state_that_no_input_holds_is_the_nearest_steady_state():
     model = saddle_model()
     x = np.array([0.3, 0.0])
     target = steady_state_target(model, x)
-    # the coolant acts on the temperature alone and can balance no more than its rate
-    assert target.residual == pytest.approx(abs(model.A[0] @ x), rel=1e-12)
-    assert target.u[0] == pytest.approx(-model.A[1] @ x / model.B[1, 0], rel=1e-12)
+    # the coolant acts on the temperature alone; steady states are on the line A[0] x = 0
+    normal = model.A[0] / np.linalg.norm(model.A[0])
+    nearest = x - normal * (normal @ x)
+    np.testing.assert_allclose(target.x, nearest, rtol=0, atol=1e-12)
+    assert target.u[0] == pytest.approx(-model.A[1] @ nearest / model.B[1, 0], rel=1e-10)
+    assert target.residual < 1e-12
 
 
 # The one-state reactor, from its nominal point to a set-point 10 K below.

@@ -12,13 +12,15 @@ from scipy.optimize import lsq_linear
 
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, State, Tuning, Weights
 from koopman_ros.control.setpoint import advance, Setpoint
-from koopman_ros.control.steady_state import partial_target, reachable_target
+from koopman_ros.control.steady_state import steady_state_target
 from koopman_ros.core.status import StatusCode
+from koopman_ros.core.steady_state import Goal
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.estimation import Estimate
 from koopman_ros.evaluation import at, run_closed_loop, simulate
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.model.observables import PolynomialObservables
+from koopman_ros.model.steady_state import model_steady_state
 from koopman_ros.plants import Actuator, Process
 from koopman_ros.plants.library.quadruple_tank import QuadrupleTank
 from support.closed_loops import EPOCH
@@ -146,26 +148,35 @@ def test_of_two_steady_states_the_one_before_is_followed():
             controller.model.states.to_physical(target.x), [0.9 * sign, 0.81], atol=1e-8)
 
 
-def test_where_there_is_no_steady_state_the_law_fails_and_nothing_raises():
+def test_where_no_input_holds_a_setpoint_the_law_goes_to_the_nearest_steady_state():
     controller = parabola()
-    # y = x^2 + w2 is never below w2
+    # y = x^2 + w2 is never below w2: a fold, where x has no effect on y
     state = disturbed(controller, [1.0, 1.0], [0.0, 0.0])
     state, rejected = asked(controller, 0.5, state)
     assert rejected is None
     state = state._replace(estimate=Estimate(state.estimate.x, np.array([0.0, 0.7])))
     state, command, report = controller.step(
         state, np.array([1.0, 1.0]), EPOCH + SECOND // 1000)
-    assert report.level == 'linear'
-    assert (report.reason.code, report.reason.cause.code) == (
-        StatusCode.LAW_FAILED, StatusCode.NO_STEADY_STATE)
     assert np.all(np.isfinite(command))
-    # the linearised model has one: 2 xi - eta + w2 = 0
     np.testing.assert_allclose(report.target.setpoint, [0.5])
-    assert report.target.state[0] == pytest.approx(1.0 + 0.5 * (-0.5 - 0.7), abs=0.01)
+    np.testing.assert_allclose(report.target.state, [0.0, 0.7], atol=0.02)
     rejected = asked(controller, -0.5)[1]
     assert (rejected.code, rejected.values['cause'].code) == (
         StatusCode.SETPOINT_NOT_HELD, StatusCode.NO_STEADY_STATE)
     assert rejected.values['nearest'] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_without_any_steady_state_the_law_fails_with_a_reason_and_nothing_raises():
+    # two tanks that only fill, from one pump: 2 q and q cannot both balance a load
+    controller = loop(tanks(np.zeros((2, 2)), [[2.0], [1.0]]))
+    target, result = controller.best.compute(
+        np.ones(2), Estimate(np.zeros(2), np.array([0.2, -0.2])), None, 1.0, None, None)
+    assert target is None
+    assert result.failure.code is StatusCode.NO_STEADY_STATE
+    state = disturbed(controller, [1.0, 1.0], [0.1, -0.1])
+    rejected = asked(controller, [1.2, 1.0], state)[1]
+    assert (rejected.code, rejected.cause.code) == (
+        StatusCode.NO_SETPOINT_HELD, StatusCode.NO_STEADY_STATE)
 
 
 # What cannot be held.
@@ -450,7 +461,7 @@ def test_a_continuous_loop_settles_at_the_steady_state_of_its_setpoint():
                           controlled=('h2',))
     np.testing.assert_allclose(run.states[-1], [1.2, 1.4], rtol=0, atol=1e-6)
     np.testing.assert_allclose(run.inputs[-1], [3.4], rtol=0, atol=1e-5)
-    with pytest.raises(ValueError, match=r'no steady state with y at \[-0\.5\]'):
+    with pytest.raises(ValueError, match=r'holds y at \[-0\.5\]; the nearest'):
         run_closed_loop(parabola().model, rate, np.ones(2), np.array([-0.5]), weights, 1.0,
                         controlled=('y',))
 
@@ -462,28 +473,25 @@ def test_a_continuous_loop_settles_at_the_steady_state_of_its_setpoint():
     (BOTH, ('h1', 'h2'), [2.0, 2.0], [-3.0, -4.0]),
     (THREE, ('h2', 'h3'), [2.0, 1.8], [-0.05, 0.0, -0.2])])
 def test_where_a_pump_does_not_suffice_the_nearest_level_is_found(model, controlled, asked, w):
-    level = next(iter(loop(model, *controlled).levels.values()))
-    limits = loop(model).tuning.limits
+    level = loop(model, *controlled).best
     w = np.array(w) / model.states.scale
     places = [model.states.names.index(name) for name in controlled]
-    found = reachable_target(
-        model, np.array(places), level.target(np.array(asked), w, None), w,
-        model.inputs.to_deviation(limits.lower), model.inputs.to_deviation(limits.upper))
+    wanted = (np.array(asked) - model.states.center[places]) / model.states.scale[places]
+    ends, n = level.input_range, model.n_x
+    found = model_steady_state(
+        model, w, np.zeros(n + model.n_u), np.concatenate((np.full(n, -np.inf), ends[0])),
+        np.concatenate((np.full(n, np.inf), ends[1])), Goal(np.array(places), wanted))
     # linear: all steady states are x = -A^-1 (B u + w), so that bounded least squares has it
     slope = -np.linalg.solve(model.A, model.B)
     rest = -np.linalg.solve(model.A, w)
-    wanted = model.states.to_deviation(model.states.center)[places] + (
-        np.array(asked) - model.states.center[places]) / model.states.scale[places]
-    best = lsq_linear(slope[places], wanted - rest[places], (
-        model.inputs.to_deviation(limits.lower), model.inputs.to_deviation(limits.upper)))
-    assert found.u == pytest.approx(best.x, abs=1e-3)
-    assert found.x == pytest.approx(slope @ best.x + rest, abs=1e-3)
-    assert found.residual == pytest.approx(0.0, abs=1e-8)
-    if model.n_u > 1:
-        # which is where the law goes
-        estimate = Estimate(np.zeros(model.n_x), w)
-        target = level.compute(np.array(asked), estimate, None, 1.0, None, None)[0]
-        assert target.u == pytest.approx(found.u)
+    best = lsq_linear(slope[places], wanted - rest[places], ends)
+    assert found[n:] == pytest.approx(best.x, abs=1e-8)
+    assert found[:n] == pytest.approx(slope @ best.x + rest, abs=1e-8)
+    # which is where the law goes; a single pump at its end goes there by itself
+    estimate = Estimate(np.zeros(model.n_x), w)
+    target = level.compute(np.array(asked), estimate, None, 1.0, None, None)[0]
+    assert target.u == pytest.approx(best.x, abs=1e-8) or (
+        model.n_u == 1 and target.u > ends[1] and best.x == pytest.approx(ends[1]))
 
 
 @pytest.mark.parametrize('seed', range(10))
@@ -494,10 +502,8 @@ def test_inputs_that_suffice_exactly_hold_the_setpoint(seed):
     # the first pump does more for each L/s, and would go beyond its range
     gain = np.array([rng.uniform(2.0, 3.0), rng.uniform(0.2, 0.4)])
     model = tanks([[-1.0]], [gain])
-    found = partial_target(
-        model, np.array([0]), np.array([model.B[0] @ upper]), np.zeros(1), -upper, upper,
-        np.zeros(3))
-    assert found.u == pytest.approx(upper, abs=1e-5)
+    found = steady_state_target(model, np.array([model.B[0] @ upper]), limits=(-upper, upper))
+    assert found.u == pytest.approx(upper, abs=1e-8)
 
 
 def test_of_more_states_than_inputs_behind_a_lag_the_target_is_a_compromise():

@@ -15,7 +15,7 @@ from scipy.special import bdtr
 
 from koopman_ros.control import Controller, InputLimits, State, Tuning
 from koopman_ros.control.laws import Law, LawResult, Linear
-from koopman_ros.control.laws.base import steady_state_target
+from koopman_ros.control.steady_state import steady_state_target
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import Estimate

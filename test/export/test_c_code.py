@@ -61,7 +61,7 @@ def test_code_of_bundled_models_gives_the_commands_and_codes_of_the_controller(
 @needs('gcc')
 def test_code_of_any_kind_of_loop_gives_the_commands_and_codes_of_the_controller() -> None:
     seen: set[tuple[str, ...]] = set()
-    for seed in (11, 19, 53):
+    for seed in (0, 6, 11, 19):
         found = compared(random_loop(seed), 100, INTERVAL, flags=('-O0', *SANITIZERS))
         assert found.error <= 1e-9
         assert found.different == ()

@@ -33,27 +33,18 @@ class Target:
     #: later targets with the seconds until then, as far as the law looks ahead
     later: tuple[tuple[float, Target], ...] = ()
 
+    @classmethod
+    def at(cls, model: LiftedModel, y: Array, w: Array | float = 0.0) -> Self:
+        """Return the target at a state and its input, y (n_x + n_u,), under a disturbance."""
+        x, u = y[:model.n_x], y[model.n_x:]
+        forcing = model.forcing(x, u) + w
+        return cls(x, u, forcing, math.hypot(*(model.drift(x) + forcing).tolist()))
+
     def after(self, seconds: float) -> Target:
         """Return the target of a later time."""
         passed = [target for until, target in self.later if until <= seconds]
         return replace(passed[-1] if passed else self, later=tuple(
             (until - seconds, target) for until, target in self.later if until > seconds))
-
-
-def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None) -> Target:
-    """
-    Solve f(x_ref) + B(x_ref) u_ref + w = 0 for u_ref by least squares, f the model's drift.
-
-    The feed-forward comes from the lifted model: the linearisation's would leave a large
-    offset far from the nominal point.
-
-    :param x_ref: (n_x,) scaled deviation.
-    :param w: (n_x,) disturbance of the state's rate, none by default.
-    """
-    w, drift = np.zeros(model.n_x) if w is None else w, model.drift(x_ref)
-    u = -model.input_inverse(x_ref).dot(drift + w)
-    forcing = model.forcing(x_ref, u) + w
-    return Target(x_ref, u, forcing, math.hypot(*(drift + forcing).tolist()))
 
 
 # Weight of a rate as the input of a law, as a share of that of its integral, the command.

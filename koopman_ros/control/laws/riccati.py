@@ -14,7 +14,6 @@ from koopman_ros.control.laws.base import (
     Law,
     LawResult,
     SolutionInfo,
-    steady_state_target,
     Target,
     Weights,
 )
@@ -187,7 +186,8 @@ class Linear(Law):
         """Return the feedback at the nominal point, and how the error grows in a sample."""
         origin = np.zeros(self.model.n_x)
         found = feedback(
-            self.model, origin, steady_state_target(self.model, origin), self.weights,
+            self.model, origin,
+            Target.at(self.model, np.zeros(self.model.n_x + self.model.n_u)), self.weights,
             interval=interval, max_gain=self.tuning.max_gain,
             max_residual=self.tuning.max_riccati_residual)
         return found, found.growth(interval)

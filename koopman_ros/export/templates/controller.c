@@ -96,6 +96,15 @@ static int all_finite(mat A) {
 /* y = y + f x */
 static void add(int n, double f, const double *x, double *y) { EACH(i, n) y[i] += f * x[i]; }
 
+/* x, y = v x - u y, u x + v y */
+static void turn(int n, double u, double v, double *x, double *y) {
+    EACH(i, n) {
+        double kept = x[i];
+        x[i] = v * kept - u * y[i];
+        y[i] = u * kept + v * y[i];
+    }
+}
+
 static void swap(int n, double *x, double *y) {
     EACH(i, n) {
         double kept = x[i];
@@ -124,14 +133,35 @@ static mat solve(mat A, mat B) {
     return B;
 }
 
-/* The pseudo-inverse, by the iteration of Schulz */
-static mat inverse(mat A) {
-    mat X = scaled(1.0 / (size(A) * size(A) + 1e-300), transposed(A)), change = X;
-    for (int k = 0; k < 100 && size(change) > 1e-9 * size(X); k++) {
-        change = plus(X, -1.0, A.m < A.n ? mul(X, mul(A, X)) : mul(mul(X, A), X));
-        X = plus(X, 1.0, change);
+/* The pseudo-inverse, with singular values up to `least` taken for 0: rotations make the rows of A
+ * orthogonal (M. R. Hestenes, SIAM J. 6 (1958)). */
+static mat inverse(mat A, double least) {
+    if (A.m > A.n) return transposed(inverse(transposed(A), least));
+    mat R = diagonal(A.m, 1.0);
+    int turned = 1;
+    for (int sweep = 0; turned && sweep < 40; sweep++) {
+        turned = 0;
+        EACH(p, A.m) for (int q = p + 1; q < A.m; q++) {
+            double a = 0.0, b = 0.0, c = 0.0, *x = A.a + p * A.n, *y = A.a + q * A.n;
+            EACH(k, A.n) {
+                a += x[k] * x[k];
+                b += y[k] * y[k];
+                c += x[k] * y[k];
+            }
+            if (!(fabs(c) > 1e-15 * sqrt(a * b))) continue;
+            double half = (b - a) / (2.0 * c);
+            double t = copysign(1.0, half) / (fabs(half) + sqrt(1.0 + half * half));
+            double u = t / sqrt(1.0 + t * t), v = 1.0 / sqrt(1.0 + t * t);
+            turn(A.n, u, v, x, y);
+            turn(A.m, u, v, R.a + p * A.m, R.a + q * A.m);
+            turned = 1;
+        }
     }
-    return X;
+    EACH(p, A.m) {
+        double value = size(block(A, p, 0, 1, A.n));
+        EACH(k, A.m) R.a[p * A.m + k] *= value > least ? 1.0 / (value * value) : 0.0;
+    }
+    return mul(transposed(A), R);
 }
 
 /* The size of the fastest mode of A, from its power 8 */
@@ -311,7 +341,7 @@ static mat drift(int linear, mat x, mat *J) {
     /* f = N'^+ A N, and the derivative of N''N' f = N''A N by each state */
     mat rate = lift(NZ, RATE, x, &AN);
     lift(NZ, LIFT, x, &N);
-    mat onto = inverse(N), rest;
+    mat onto = inverse(N, 1e-15 * size(N)), rest;
     f = mul(onto, rate);
     rest = plus(rate, -1.0, mul(N, f));
     EACH(k, J ? N_PHI : 0) {
@@ -567,84 +597,203 @@ static int law(int linear, const koopman_estimate *from, mat y_ref, double inter
 
 /* --- Steady states --- */
 
-/* Solve f(x) + B(x) u + w = 0 for y = (x, u) by Gauss-Newton steps, each to the solution nearest
- * to an anchor in units of reach, 0 for a number that stays; returns 0 where there is none. */
-static int equilibrium(int linear, mat w, const double *reach, mat anchor, mat *y) {
-    mat J, rate = rate_under(linear, *y, w, &J);
-    EACH(count, 30) {
-        mat by_reach = J, away = plus(*y, -1.0, anchor);
-        double length = 0.0, slope;
-        int free = 0;
+/* Minimise |M y - m| for each of `count` matrices in turn, each among the minimisers of those
+ * before; fixed variables stay. Of each of these `slope` is the derivative by it of the first
+ * |M y - m|^2 / 2 that it changes when the others respond. */
+static void minimised(int count, const mat *M, const mat *m, const int *fixed, mat *y,
+                      double *slope) {
+    mat freedom = zeros(NXU, NXU), moved = freedom;
+    int open[NXU];
+    EACH(k, NXU) {
+        (fixed[k] ? &moved : &freedom)->a[k * NXU + k] = 1.0;
+        open[k] = fixed[k];
+        slope[k] = 0.0;
+    }
+    EACH(r, count) {
+        double least = STEADY_RANK * size(M[r]);
+        mat part = mul(M[r], freedom), onto = inverse(part, least), rest, change;
+        *y = plus_mul(*y, 1.0, onto, plus_mul(m[r], -1.0, M[r], *y));
+        rest = plus_mul(scaled(-1.0, m[r]), 1.0, M[r], *y);
+        moved = plus_mul(moved, -1.0, onto, mul(M[r], moved));
+        change = mul(M[r], moved);
         EACH(k, NXU) {
-            EACH(i, NX) J.a[i * NXU + k] *= reach[k] > 0.0;
-            EACH(i, NX) by_reach.a[i * NXU + k] *= reach[k];
-            away.a[k] *= reach[k] > 0.0;
-            free += reach[k] > 0.0;
+            mat column = block(change, 0, k, change.m, 1);
+            if (!open[k] || !(size(column) > least)) continue;
+            slope[k] = mul(transposed(rest), column).a[0];
+            open[k] = 0;
         }
-        if (!all_finite(J) || !all_finite(rate)) return 0;
-        mat step = mul(inverse(by_reach), plus(mul(J, away), -1.0, rate));
+        freedom = plus_mul(freedom, -1.0, onto, part);
+    }
+}
+
+/* The same within limits; equal ones make a variable given, which is taken from `start`. */
+static mat bounded_least_squares(int count, const mat *M, const mat *m, const double *lower,
+                                 const double *upper, mat start) {
+    mat y = start, best;
+    double slope[NXU];
+    int at[NXU], inside = 1;
+    EACH(k, NXU) at[k] = lower[k] == upper[k];
+    minimised(count, M, m, at, &y, slope);
+    EACH(k, NXU) {
+        double slack = lower[k] < upper[k] ? STEADY_TOLERANCE : 0.0;
+        inside = inside && y.a[k] >= lower[k] - slack && y.a[k] <= upper[k] + slack;
+        at[k] = at[k] || y.a[k] < lower[k] || y.a[k] > upper[k];
+    }
+    EACH(k, NXU) y.a[k] = within(y.a[k], lower[k], upper[k]);
+    for (int changes = 0; !inside && changes < STEADY_CHANGES * NXU; changes++) {
+        double share = 1.0, most = STEADY_RANK;
+        int first = -1;
+        best = y;
+        minimised(count, M, m, at, &best, slope);
+        /* as far as the first limit on the way */
         EACH(k, NXU) {
-            step.a[k] = reach[k] * step.a[k] - away.a[k];
-            length = larger(length, fabs(step.a[k]));
+            double step = best.a[k] - y.a[k], room = (step > 0.0 ? upper : lower)[k] - y.a[k];
+            if (at[k] || !(fabs(step) > fabs(room) + STEADY_TOLERANCE)) continue;
+            if (first >= 0 && !(room / step < share)) continue;
+            share = room / step;
+            first = k;
         }
-        *y = plus(*y, length > 0.5 ? 0.5 / length : 1.0, step);
-        slope = size(J);
-        rate = rate_under(linear, *y, w, &J);
-        if (size(rate) <= 1e-9 * slope && (length <= 1e-6 || free <= NX)) return 1;
+        if (first >= 0) {
+            double up = best.a[first] - y.a[first];
+            y = plus(y, share, plus(best, -1.0, y));
+            y.a[first] = (up > 0.0 ? upper : lower)[first];
+            at[first] = 1;
+            continue;
+        }
+        EACH(k, NXU) y.a[k] = within(best.a[k], lower[k], upper[k]);
+        /* a variable leaves its limit where that is an improvement */
+        EACH(k, NXU) {
+            double gain = y.a[k] == lower[k] ? -slope[k] : slope[k];
+            if (!at[k] || lower[k] == upper[k] || !(gain > most)) continue;
+            most = gain;
+            first = k;
+        }
+        if (first < 0) break;
+        at[first] = 0;
+    }
+    return y;
+}
+
+static double largest(mat A) {
+    double most = 0.0;
+    EACH(k, A.m * A.n) most = larger(most, fabs(A.a[k]));
+    return most;
+}
+
+/* Move y = (x, u), by Newton's method, to the state of rest under w that is nearest to a goal, with
+ * NaN for any value, and of those that are as near to an anchor; returns 0 where there is none
+ * within the limits. */
+static int steady_state(int linear, mat w, const double *lower, const double *upper,
+                        const double *goal, mat anchor, mat *y) {
+    mat J, before, M[3], m[3];
+    double radius = INFINITY, share = 1.0, small = 0.0, now = 0.0;
+    int fresh = 1;
+    EACH(k, NXU) y->a[k] = within(y->a[k], lower[k], upper[k]);
+    M[1] = m[1] = zeros(NXU, NXU);
+    m[1].n = 1;
+    EACH(k, NXU) if (!isnan(goal[k])) {
+        M[1].a[k * NXU + k] = 1.0;
+        m[1].a[k] = goal[k];
+    }
+    mat wanted = M[1], values = m[1], every = diagonal(NXU, 1.0), found;
+    found = rate_under(linear, *y, w, NULL);
+    EACH(count, STEADY_STEPS) {
+        double low[NXU], high[NXU], length;
+        if (fresh) {
+            rate_under(linear, *y, w, &J);
+            if (!all_finite(J) || !all_finite(found)) return 0;
+            small = STEADY_TOLERANCE * size(J);
+            before = *y;
+            M[0] = J;
+            m[0] = plus_mul(scaled(-1.0, found), 1.0, J, *y);
+            M[1] = every;
+            m[1] = *y;
+            if (size(found) > small) before = bounded_least_squares(2, M, m, lower, upper, *y);
+            now = size(plus_mul(scaled(-1.0, values), 1.0, wanted, before));
+        }
+        /* no further from the nearest place of rest than the linearisation has proved to hold */
+        EACH(k, NXU) low[k] = larger(lower[k], before.a[k] - radius);
+        EACH(k, NXU) high[k] = smaller(upper[k], before.a[k] + radius);
+        m[0] = plus_mul(scaled(-1.0, found), 1.0, J, *y);
+        M[1] = wanted;
+        m[1] = values;
+        M[2] = every;
+        m[2] = anchor;
+        mat best = bounded_least_squares(3, M, m, low, high, before);
+        mat step = plus(best, -1.0, *y), back = plus(before, -1.0, *y), left, bend, after;
+        double near = size(plus_mul(scaled(-1.0, values), 1.0, wanted, best)), away;
+        int ends = 0, resting;
+        length = largest(step);
+        if (length <= STEADY_TOLERANCE) {
+            *y = best;
+            return size(plus_mul(found, 1.0, J, step)) <= small;
+        }
+        if (length >= 0.5 * radius) ends = now - near <= STEADY_FOLD * now;
+        if (ends && size(found) <= small) return 1;
+        resting = ends || largest(back) > radius;
+        if (resting) step = scaled(share, back);
+        left = rate_under(linear, plus(*y, 1.0, step), w, NULL);
+        bend = plus_mul(plus(left, -1.0, found), -1.0, J, step);
+        fresh = all_finite(left);
+        if (fresh) {
+            mat place = plus(*y, 1.0, step);
+            after = place;
+            m[0] = plus_mul(scaled(-1.0, bend), 1.0, J, place);
+            M[1] = resting ? every : wanted;
+            m[1] = mul(M[1], place);
+            m[2] = place;
+            if (size(bend) > small)
+                after = bounded_least_squares(resting ? 2 : 3, M, m, lower, upper, place);
+            away = size(plus(after, -1.0, place));
+            fresh = away <= STEADY_CURVATURE * size(step) && (resting
+                || size(plus_mul(scaled(-1.0, values), 1.0, wanted, after))
+                    <= now + STEADY_TOLERANCE + STEADY_PROGRESS * (near - now + away));
+            if (fresh) *y = place;
+            if (fresh) found = left;
+        }
+        if (resting) share = fresh ? smaller(1.0, 2.0 * share) : 0.5 * share;
+        else radius = fresh ? 2.0 * radius : 0.5 * smaller(length, radius);
     }
     return 0;
 }
 
-/* Move y to the steady state nearest to an anchor that inputs within their range hold, if there is
- * one after at most so many of them were put to an end of it. */
-static void bring_within(int linear, mat w, double *reach, mat anchor, double slack, double far,
-                         int most, mat *y) {
-    mat found = *y;
-    for (;; most--) {
-        double excess = -INFINITY;
-        int worst = 0;
-        EACH(i, NU) {
-            double u = found.a[NX + i], beyond = larger(LOWER_V[i] - u, u - UPPER_V[i]);
-            if (beyond > excess) worst = i;
-            excess = larger(excess, beyond);
-        }
-        if (!(excess > slack)) *y = found;
-        if (!(excess > slack) || most == 0) return;
-        reach[NX + worst] = 0.0;
-        found.a[NX + worst] = within(found.a[NX + worst], LOWER_V[worst], UPPER_V[worst]);
-        if (!equilibrium(linear, w, reach, anchor, &found)) return;
-        /* further off it is on another branch */
-        EACH(i, NX) if (!(fabs(found.a[i] - y->a[i]) <= far * HALF_WIDTH[i])) return;
-    }
-}
-
-/* Find the steady state y = (x, u) of a set-point (NC), in its units, under a disturbance; y is
- * where to begin. Returns 0 where there is none. */
+/* Find the steady state y = (x, u) nearest to a set-point (NC), in its units, under a disturbance,
+ * with inputs within their range where there is one near; y is where to begin. Returns 0 where
+ * there is none. */
 static int find_target(int linear, const double *setpoint, mat w, mat *y) {
-    mat none = zeros(NXU, 1), J, u;
-    double reach[NXU];
+    mat none = zeros(NXU, 1), found, J, by_input;
+    double lower[NXU], upper[NXU], goal[NXU];
     int inside = 1;
-    EACH(k, NXU) reach[k] = 1.0;
+    EACH(k, NXU) {
+        goal[k] = NAN;
+        lower[k] = -INFINITY;
+        upper[k] = INFINITY;
+    }
     EACH(i, NC) {
         int k = CONTROLLED[i];
-        y->a[k] = (setpoint[i] - STATES_CENTER[k]) / STATES_SCALE[k];
-        reach[k] = 0.0;
+        goal[k] = y->a[k] = (setpoint[i] - STATES_CENTER[k]) / STATES_SCALE[k];
     }
     if (CONTROLS_ALL) {
         put(y, NX, 0, zeros(NU, 1));
-        mat f = rate_under(linear, *y, w, &J);
-        put(y, NX, 0, scaled(-1.0, mul(inverse(block(J, 0, NX, NX, NU)), f)));
-    } else {
-        if (!equilibrium(linear, w, reach, none, y)) return 0;
-        bring_within(linear, w, reach, none, 0.0, INFINITY, NU - NC, y);
+        J = input_matrix(linear, state_of(*y), zeros(NU, 1), &by_input);
+        put(y, NX, 0, scaled(-1.0, mul(inverse(J, 1e-15 * size(J)),
+                                       rate_under(linear, *y, w, NULL))));
     }
-    u = physical_input(input_of(*y));
-    EACH(i, NU) inside = inside && u.a[i] >= LIMITS_LOWER[i] && u.a[i] <= LIMITS_UPPER[i];
-    if (NU > 1 && NC <= NU && !inside) {
-        EACH(k, NXU) reach[k] = 1e3;
-        EACH(i, NC) reach[CONTROLLED[i]] = 1.0;
-        bring_within(linear, w, reach, *y, 1e-6, 2.0, NU, y);
+    if (!(CONTROLS_ALL && size(rate_under(linear, *y, w, NULL)) <= STEADY_TOLERANCE)
+            && !steady_state(linear, w, lower, upper, goal, none, y)) return 0;
+    EACH(i, NU) {
+        double u = y->a[NX + i];
+        lower[NX + i] = LOWER_V[i];
+        upper[NX + i] = UPPER_V[i];
+        inside = inside && u >= LOWER_V[i] - STEADY_TOLERANCE && u <= UPPER_V[i] + STEADY_TOLERANCE;
     }
+    if (NU == 1 || inside) return 1;
+    found = *y;
+    if (!steady_state(linear, w, lower, upper, goal, none, &found)) return 1;
+    /* further off it is on another branch */
+    EACH(i, NX) if (!(fabs(found.a[i] - y->a[i]) <= 2.0 * HALF_WIDTH[i] + STEADY_TOLERANCE))
+        return 1;
+    *y = found;
     return 1;
 }
 
@@ -848,13 +997,19 @@ static void predict(const koopman_state *s, double elapsed, koopman_estimate *e)
 static mat position(const koopman_estimate *e, const double *y) {
     mat C = of(NY, NX, OUTPUTS), onto = of(NX, NY, FROM_OUTPUTS), rest = of(NY, 1, y), found;
     mat state = e->known ? physical(OF_X, of(NX, 1, e->x)) : of(NX, 1, STATES_CENTER);
-    double reach[NXU];
+    double lower[NXU], upper[NXU], goal[NXU];
     if (DETERMINED) return mul(onto, rest);
     state = plus(state, 1.0, mul(onto, plus(rest, -1.0, mul(C, state))));
     if (e->known || !RESTS || !all_finite(state)) return state;
-    EACH(k, NXU) reach[k] = k >= NX || !MEASURED[k];
     found = joined(deviation(OF_X, state.a), zeros(NU, 1));
-    if (!equilibrium(0, zeros(NX, 1), reach, zeros(NXU, 1), &found)) return state;
+    EACH(k, NXU) {
+        double beyond = k < NX ? MARGIN[LAWS - 1] * HALF_WIDTH[k] : INFINITY;
+        int measured = k < NX && MEASURED[k];
+        goal[k] = NAN;
+        lower[k] = measured ? found.a[k] : k < NX ? CORNERS[k] - beyond : -beyond;
+        upper[k] = measured ? found.a[k] : k < NX ? CORNERS[NX + k] + beyond : beyond;
+    }
+    if (!steady_state(0, zeros(NX, 1), lower, upper, goal, zeros(NXU, 1), &found)) return state;
     return physical(OF_X, state_of(found));
 }
 

@@ -21,6 +21,7 @@ from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.datasets import Array, Episode, PlantDescription, sample_interval
 from koopman_ros.core.integration import runge_kutta_step
 from koopman_ros.core.solvers import decaying
+from koopman_ros.core.steady_state import steady_state
 from koopman_ros.learning.identification.simulation import fitted, simulated
 from koopman_ros.model import Box, InputTerms, PolynomialObservables
 from koopman_ros.model.observables import Monomials
@@ -41,10 +42,8 @@ def chooses_terms(degree: int, coefficients: int) -> bool:
     return degree > 1 and coefficients > MOST_COEFFICIENTS
 
 
-
-# Of the search of a steady state: the range is that of noisy measurements, and a search that is so
-# far outside does not come back.
-_SLIGHTLY_OUTSIDE, _LOST = 1.1, 1e3
+# A steady state is searched for within the range of noisy measurements, in scaled deviations.
+_SLIGHTLY_OUTSIDE = 1.1
 
 
 def box_of(plant: PlantDescription, episodes: Sequence[Episode]) -> Box:
@@ -332,23 +331,20 @@ def steady_point(drift: Drift, x: Array, u: Array) -> tuple[Array, Array]:
     :param x: (n_x,) in state units.
     :param u: (n_u,) in input units.
     """
-    box = drift.box
-    xi, v = box.states.to_deviation(x), box.inputs.to_deviation(u)
-    n_x = len(xi)
-    held = np.linalg.matrix_rank(drift.scaled_input_matrix(xi)) == n_x
-    for _ in range(50):
-        rate = drift.scaled_rate(xi, v)
-        slope, B = drift.scaled_slope(xi, v), drift.scaled_input_matrix(xi)
-        change = -np.linalg.pinv(np.hstack([0.0 * slope if held else slope, B])) @ rate
-        xi, v = xi + change[:n_x], v + change[n_x:]
-        # far outside, the polynomial means nothing and overflows at last
-        if np.max(np.abs(change)) < 1e-13 or np.max(np.abs(xi)) > _LOST:
-            break
-    near = np.all(np.abs(xi) <= _SLIGHTLY_OUTSIDE)
-    if not (near and np.all(np.abs(drift.scaled_rate(xi, v)) < 1e-9)):
+    box, n_x = drift.box, len(x)
+    y = np.concatenate((box.states.to_deviation(x), box.inputs.to_deviation(u)))
+    limit = np.where(np.arange(len(y)) < n_x, _SLIGHTLY_OUTSIDE, np.inf)
+    held = np.full(len(y), np.linalg.matrix_rank(drift.scaled_input_matrix(y[:n_x])) == n_x)
+    held[n_x:] = False
+    found = steady_state(
+        lambda y: drift.scaled_rate(y[:n_x], y[n_x:]),
+        lambda y: np.hstack([drift.scaled_slope(y[:n_x], y[n_x:]),
+                             drift.scaled_input_matrix(y[:n_x])]),
+        y, np.where(held, y, -limit), np.where(held, y, limit), anchor=y)
+    if found is None:
         raise ValueError('no steady state was found within the range of the episodes: record '
                          'around a steady state of the plant')
-    return box.states.to_physical(xi), box.inputs.to_physical(v)
+    return box.states.to_physical(found[:n_x]), box.inputs.to_physical(found[n_x:])
 
 
 def prediction_error(rate: Rate, segments: Segments, scale: Array) -> Array:

@@ -15,10 +15,11 @@ from scipy.optimize import lsq_linear, minimize
 
 from koopman_ros.control import Controller, InputLimits, Tuning
 from koopman_ros.control.events import SetpointRequest
-from koopman_ros.control.laws.base import LawResult, steady_state_target
+from koopman_ros.control.laws.base import LawResult
 from koopman_ros.control.mpc import MPCParameters, RecedingHorizon
 from koopman_ros.control.mpc.grid import HorizonGrid
 from koopman_ros.control.state import State
+from koopman_ros.control.steady_state import steady_state_target
 from koopman_ros.core.integration import runge_kutta_step
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.status import StatusCode
@@ -173,7 +174,7 @@ def test_range_is_planned_for_optimally():
 @pytest.mark.parametrize('change_after', [None, 75.0])
 def test_plan_with_active_limits_is_that_of_a_general_optimiser(change_after):
     """Against SLSQP on simulations of the model, with range, rate and limits of the states."""
-    model, interval, x, x_ref = shipped('two_state'), 30.0, [-0.3, -0.2], [0.05, 0.2]
+    model, interval, x = shipped('two_state'), 30.0, [-0.3, -0.2]
     u_max, change, e_max = 0.15, 0.12, [9.0, 0.08]
     inputs, states, w = model.inputs, model.states, np.array([0.01, -0.02])
     one = RecedingHorizon(model, Tuning.for_model(
@@ -183,10 +184,13 @@ def test_plan_with_active_limits_is_that_of_a_general_optimiser(change_after):
         input_weight=0.1 / inputs.scale ** 2, learned_model_margin=100.0, linear_model_margin=100.0
         ).for_signals(model, states.names),
         MPCParameters(upper=states.center + np.array(e_max) * states.scale))
-    estimate, target = Estimate(np.array(x), w), steady_state_target(model, np.array(x_ref))
-    end = target
-    if change_after is not None:
-        end = steady_state_target(model, np.array([-0.02, 0.12]))
+    # temperatures, with the concentrations at which they can be held
+    target, end = (steady_state_target(model, np.array([kelvin]), controlled=np.array([1]))
+                   for kelvin in (0.2, 0.12))
+    estimate = Estimate(np.array(x), w)
+    if change_after is None:
+        end = target
+    else:
         target = replace(target, later=((change_after, end),))
     found = one.compute(estimate, target, None, interval, inputs.center)
     assert found.failure is None

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from koopman_ros.control import averaged, recentred, steady_state_target, Weights
-from koopman_ros.control.steady_state import partial_target, resting_state
 from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.estimation import Estimate
 from koopman_ros.estimation.disturbance_observer import simulated
@@ -22,6 +21,7 @@ from koopman_ros.learning.drift_sampling import learn_lift
 from koopman_ros.learning.identification import identify
 from koopman_ros.learning.lift.input_model import InputModel
 from koopman_ros.model import Box
+from koopman_ros.model.steady_state import resting_state
 from koopman_ros.parameters.trainer_table import trainer_table
 from koopman_ros.plants import (
     advance,
@@ -104,10 +104,10 @@ def test_targets_are_steady_states_of_the_plant():
     np.testing.assert_allclose(target.forcing, model.input_matrix(xi) @ target.u, rtol=0,
                                atol=1e-12)
     # the temperature alone, with an input to spare
-    free = partial_target(model, np.array([1]), xi[1:], np.zeros(2), -np.ones(2), np.ones(2),
-                          np.zeros(4))
+    free = steady_state_target(model, xi[1:], controlled=np.array([1]),
+                               limits=(-np.ones(2), np.ones(2)))
     rate = model.rate_under(free.u)(free.x)
-    assert free.x[1] == xi[1]
+    assert free.x[1] == pytest.approx(xi[1], abs=1e-9)
     np.testing.assert_allclose(rate, 0.0, rtol=0, atol=1e-9)
     np.testing.assert_allclose(resting_state(model, target.u, np.zeros(2), np.zeros(2)), xi,
                                rtol=0, atol=1e-7)

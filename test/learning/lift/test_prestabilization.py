@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.control import feedback, Form, Weights
-from koopman_ros.control.laws.base import steady_state_target
+from koopman_ros.control.steady_state import steady_state_target
 from koopman_ros.core.datasets import DriftSamples, PlantDescription
 from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.learning import IncrementalTraining, train
