@@ -97,7 +97,7 @@ class PageLayout:
         ui.page_title(f'{TABS[path]} – {source.title}')
         ui.colors(primary='#4a4a47', secondary='#6b6b67', accent='#4a4a47', positive='#4a4a47')
         self._head(path)
-        self.body = box('page', tag='main')
+        self.body = box('page')
 
     def _head(self, path: str) -> None:
         with box('head', tag='header') as head:

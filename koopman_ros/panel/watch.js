@@ -151,7 +151,7 @@ addEventListener('DOMContentLoaded', () => {
     else if (head?.dataset.sound && sounds()) beep(Number(head.dataset.sound));
   }, 2000);
 
-  setInterval(() => {
+  const tick = () => {
     const beat = document.getElementById('beat'), head = document.querySelector('[data-title]');
     if (head && document.title !== head.dataset.title) document.title = head.dataset.title;
     const sound = document.getElementById('sound');
@@ -179,5 +179,7 @@ addEventListener('DOMContentLoaded', () => {
       fetch('/session').then(response => { if (response.status === 401) location.reload(); })
         .catch(() => {}).finally(() => setTimeout(() => { waiting = false; }, 4000));
     }
-  }, 200);
+  };
+  tick();
+  setInterval(tick, 200);
 });

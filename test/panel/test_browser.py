@@ -277,6 +277,7 @@ def test_a_model_is_recorded_trained_compared_activated_and_replaced(site: Site)
                 'controller', load_rejected_model=force, model=name).successful)
         # the panel knows of it
         page.goto(f'{site.url}/tuning')
+        page.wait_for_function('window.did_handshake')
         card(page, 'Parameters of the controller').get_by_text('general', exact=True).click()
         expect(page.locator('[data-parameter="load_rejected_model"]').get_by_role(
             'combobox')).to_have_value('false')
