@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 import contextlib
 import math
 import os
+import re
 import sys
 import time
 from typing import Any, TypeVar
@@ -22,6 +23,7 @@ import yaml
 from koopman_ros import __version__
 from koopman_ros.core.yaml_text import load_yaml
 from koopman_ros.ros import topics
+from koopman_ros.ros.managed import one_line
 from koopman_ros.ros.process import init
 from koopman_ros.ros.remote_node import repeated
 
@@ -39,6 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         with _node() as node:
+            _check(node, options)
             options.run(node, options)
     except CommandError as error:
         print(f'koopman_ros: {error}', file=sys.stderr)
@@ -83,6 +86,22 @@ def _node() -> Iterator[Node]:
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
+
+
+def _check(node: Node, options: argparse.Namespace) -> None:
+    """Raise CommandError for a name or a number that cannot be used."""
+    for kind in ('topic', 'service', 'node'):
+        if (name := getattr(options, kind, None)) is not None:
+            try:
+                # a node's name is as one of a topic
+                node.resolve_topic_name(name)
+            except (RuntimeError, ValueError) as error:
+                raise CommandError(f'{name!r} is not a name of a {kind} ({one_line(error)}): use '
+                                   'e.g. /line_1/temperature') from error
+    for option, least in (('timeout', 0.0), ('count', 0)):
+        value = getattr(options, option, least)
+        if not least <= value < math.inf:
+            raise CommandError(f'--{option} {value} must be at least {least:g}, and finite')
 
 
 def _wait(node: Node, seconds: float, found: Callable[[], T], missing: str) -> T:
@@ -131,6 +150,13 @@ def _filled(message: Any, text: str | None) -> Any:
             if 'double' in kinds[name] or 'float' in kinds[name]:
                 # 45 stands for 45.0
                 value = [*map(float, value)] if isinstance(value, list) else float(value)
+            elif bits := re.search(r'(u?)int(\d+)', kinds[name]):
+                # the middleware would send the number without its upper bits
+                lowest, size = -2 ** (int(bits[2]) - 1) * (not bits[1]), 2 ** int(bits[2])
+                for number in value if isinstance(value, list) else [value]:
+                    if type(number) is not int or not 0 <= number - lowest < size:
+                        raise ValueError(f'{name} = {number} must be an integer from {lowest} to '
+                                         f'{lowest + size - 1}')
             setattr(part, name, value)
 
     try:

@@ -69,6 +69,18 @@ def test_parameters_are_listed_read_and_set() -> None:
     (('call', '/none', '--timeout', '0.5'), 'no service /none'),
     (('param', '/none', '--timeout', '0.5'), 'no node /none'),
     (('param', '/controller', 'none', '--timeout', '60'), 'has no parameter none'),
+    (('pub', '/bad topic', '{}'), "'/bad topic' is not a name of a topic"),
+    (('echo', '/a//b'), "'/a//b' is not a name of a topic"),
+    (('call', '/bad service'), 'is not a name of a service'),
+    (('param', '/bad node'), "'/bad node' is not a name of a node"), (('param', ''), 'of a node'),
+    *((('echo', '/none', '--timeout', seconds), '--timeout') for seconds in ('nan', 'inf', '-1')),
+    (('echo', '/none', '--count', '-1'), '--count -1 must be at least 0'),
+    (('pub', '/setpoint', '{header: {stamp: {sec: 99999999999}}}', '--timeout', '60'),
+     'sec = 99999999999 must be an integer from -2147483648 to 2147483647'),
+    (('pub', '/setpoint', '{header: {stamp: {nanosec: -1}}}', '--timeout', '60'),
+     'from 0 to 4294967295'),
+    (('pub', '/none', '{data: 1.5}', '--type', 'std_msgs/msg/UInt8'), 'from 0 to 255'),
+    (('pub', '/none', '{data: [1, 300]}', '--type', 'std_msgs/msg/UInt8MultiArray'), 'data = 300'),
 ])
 @pytest.mark.usefixtures('harness')
 def test_a_failed_command_has_a_reason(words: tuple[str, ...], said: str) -> None:
