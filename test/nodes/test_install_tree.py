@@ -4,12 +4,13 @@
 """
 The package as it is installed: by colcon, as `ros2 run` finds it, and as a wheel by pip.
 
-Processes are started from either. Those of the wheel have an environment of their own, which
-notes every file of the repository that is opened in it.
+The wheel is built from a source archive. Processes are started from either. Those of the wheel
+have an environment of their own, which notes every file of the repository that is opened in it.
 """
 
 import os
 from pathlib import Path
+import shutil
 import site
 import sys
 import venv
@@ -37,15 +38,25 @@ sys.addaudithook(note)
 
 @pytest.fixture(scope='module')
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Installation:
-    """Build a wheel and install it into an empty environment; requirements are those of here."""
+    """
+    Build a wheel from a source archive, and install it into an empty environment.
+
+    Requirements are those of here.
+    """
     folder = tmp_path_factory.mktemp('wheel')
-    wheels = folder / 'wheels'
-    wheels.mkdir()
-    built = run((sys.executable, '-c', 'import sys; from setuptools import build_meta; '
-                 'build_meta.build_wheel(sys.argv[1])', str(wheels)),
-                cwd=sources(folder / 'source'))
-    assert built.returncode == 0, built.stdout + built.stderr
-    (wheel,) = wheels.glob('*.whl')
+    (folder / 'built').mkdir()
+
+    def build(kind: str, pattern: str, where: Path) -> Path:
+        built = run((sys.executable, '-c', 'import sys; from setuptools import build_meta; '
+                     f'build_meta.build_{kind}(sys.argv[1])', str(folder / 'built')), cwd=where)
+        assert built.returncode == 0, built.stdout + built.stderr
+        (found,) = (folder / 'built').glob(pattern)
+        return found
+
+    archive = build('sdist', '*.tar.gz', sources(folder / 'source'))
+    shutil.unpack_archive(archive, folder / 'unpacked', filter='data')
+    (unpacked,) = (folder / 'unpacked').iterdir()
+    wheel = build('wheel', '*.whl', unpacked)
     venv.create(folder / 'environment', symlinks=True)
     environment = folder / 'environment'
     installed = run((sys.executable, '-m', 'pip', '--python', str(environment / 'bin/python'),
