@@ -310,10 +310,17 @@ def test_launch_file_gives_its_parameter_file_to_all_nodes() -> None:
     for node in nodes:
         assert node.package == 'koopman_ros'
         assert node.ros_arguments == [
-            '--params-file', f'{ROOT}/config/plants/two_tanks.yaml']
+            '--params-file', f'{ROOT}/config/plants/two_tanks.yaml', '--log-level', 'info']
         assert Path(node.ros_arguments[1]).is_file()
-        assert node.parameters == {'autostart': False}
-    assert _launched({'parameters': 'loop.yaml'})[0].ros_arguments[1] == 'loop.yaml'
+        assert node.parameters == {'autostart': False, **(
+            {} if node.executable == 'plant' else {'use_sim_time': False})}
+        assert (node.namespace(), node.respawn()) == ('', 'false')
+    given = _launched({'parameters': 'loop.yaml', 'namespace': 'line_1', 'use_sim_time': 'true',
+                       'log_level': 'debug', 'respawn': 'true'})
+    for node in given:
+        assert node.ros_arguments == ['--params-file', 'loop.yaml', '--log-level', 'debug']
+        assert (node.namespace(), node.respawn()) == ('line_1', 'true')
+    assert [node.parameters.get('use_sim_time') for node in given] == [None, True, True]
 
 
 def test_no_node_starts_without_the_parameter_file_of_the_launch(ros: Harness) -> None:
