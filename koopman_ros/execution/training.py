@@ -40,6 +40,11 @@ class JobState:
         """Whether a lift was learned or tried and does not suffice."""
         return bool(self.summary and not self.summary['accepted'])
 
+    @property
+    def cancelled(self) -> bool:
+        """Whether it has ended because that was requested."""
+        return self.text == _CANCELLED
+
 
 class TrainingProgress:
     """

@@ -180,13 +180,15 @@ class ControllerNode(ManagedNode):
     def _exclusive_topics(self, wiring: SignalTopics) -> dict[str, str]:
         """Return the action on each topic on which only one node may publish."""
         own = self._signals.defaults().values()
-        return {place.topic: f'{verb} the {what}' for verb, places in (
+        clock = {topics.CLOCK: 'publish the time'} if (
+            self.get_parameter('use_sim_time').value) else {}
+        return {**clock, **{place.topic: f'{verb} the {what}' for verb, places in (
             ('command', {base_name(name, self._signals.inputs[name]): place
                          for name, place in wiring.commands.items()}),
             ('publish', wiring.measured)) for what, place in places.items()
             # a message of named values may be one of several that make up a sample, but not on
             # the topic that is named after one of them
-            if '[' not in place.field or place.topic in own}
+            if '[' not in place.field or place.topic in own}}
 
     def _answer(self, sample: Sample) -> None:
         stamp_ns, arrived, before = sample.stamp_ns, self._timing.now(), self._loop.state
@@ -303,7 +305,8 @@ class ControllerNode(ManagedNode):
                      if not topics.has_subscribers(publisher)],
             unheard_for=time.monotonic() - self._received,
             setpoint_received=self._requests.setpoint_received,
-            request=self._requests.complaint,
+            request='; '.join(filter(None, (
+                self._requests.complaint, self._requests.sender_gone))),
             model_rejected=self._models.complaint,
             model=lambda: {**self._models.figures(),
                            'dead time change': self._dead_time_change or 'none',

@@ -82,17 +82,19 @@ class PlantNode(ManagedNode):
 
         self._received: dict[str, float] = {}  # of the commands for the last measurement
         wiring = SignalTopics.of(signals, parameters, PLANT_KINDS)
+        clock = parameters.publish_clock and not self._real_time
         # the subscriptions first: a controller that hears the measurement has then seen them, too
         self._endpoints = endpoints = topics.EndpointMonitor(
             self, lambda: self._diagnostics.publish_if_changed(), {
                 place.topic: f'command the {base_name(name, signals.inputs[name])}'
                 for name, place in wiring.commands.items()} | {
                 place.topic: f'publish the {name}' for name, place in (
-                    *wiring.measured.items(), *wiring.measured_disturbances.items())})
+                    *wiring.measured.items(), *wiring.measured_disturbances.items())} | (
+                {topics.CLOCK: 'publish the time'} if clock else {}))
         self._command_subscriber = SignalSubscriber(
             self, endpoints.subscribe, wiring.commands, signals.inputs, self._on_command)
-        self._clock_publisher = endpoints.publish(topics.CLOCK, qos=topics.CLOCK_QOS) if (
-            parameters.publish_clock and not self._real_time) else None
+        self._clock_publisher = endpoints.publish(
+            topics.CLOCK, qos=topics.CLOCK_QOS) if clock else None
         # the states last: who has found them has found the inputs, too
         self._applied = SignalPublisher(wiring.applied, signals.inputs, self._latched)
         self._disturbances = SignalPublisher(

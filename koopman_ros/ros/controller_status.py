@@ -79,7 +79,9 @@ class StatusContext:
     unheard: Sequence[str]  #: topics of the commands without a subscriber
     unheard_for: float  #: s for which not all have had one
     setpoint_received: bool
-    request: str  #: why the operator's last request was rejected or limited, or empty
+    #: why the operator's last request was rejected or limited, or that its sender has gone; or
+    #: empty
+    request: str
     model_rejected: str  #: why the last model, or the current one, was rejected; or empty
     model: Callable[[], Mapping[str, object]]  #: gives figures of the current model
 
@@ -231,7 +233,10 @@ def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
             'measurement with its time')
     elif now.timing.silence > overdue or (unmeasured and now.counts.measurements):
         yield MEASUREMENTS, (
-            f'the last measurement is {now.timing.silence:.0f} s old: check sensor and plant')
+            f'the last measurement is {now.timing.silence:.0f} s old: check sensor and plant'
+            if now.counts.measurements else
+            f'no measurement{now.awaited} was received for {now.timing.silence:.0f} s: check '
+            'sensor and plant')
     if report.measurement.uncertain:
         yield MEASUREMENTS, (
             f'the quality of {" and ".join(report.measurement.uncertain)} is uncertain: a Kalman '

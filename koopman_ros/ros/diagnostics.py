@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.qos import QoSProfile
@@ -17,7 +16,6 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from koopman_ros.core.plugins import contained
 from koopman_ros.parameters.signal_topics import DIAGNOSTICS
 from koopman_ros.ros.hosted import HostedNode, wall_timer
-from koopman_ros.ros.time_conversion import stamp_message
 
 
 class Severity(Enum):
@@ -81,7 +79,7 @@ class Diagnostics:
         prefix = self._node.get_fully_qualified_name().lstrip('/')
         message = DiagnosticArray(status=[
             self._message(f'{prefix}: {name}', status) for name, status in statuses])
-        message.header.stamp = stamp_message(time.time_ns())
+        message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
 
     def _message(self, name: str, status: TaskReport) -> DiagnosticStatus:

@@ -91,12 +91,15 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         self.active = True
         done = self._attempt(self.activate)
         self.active = done == TransitionCallbackReturn.SUCCESS
+        if self.active:
+            self.get_logger().info('activated')
         return done
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop acting, also if :meth:`deactivate` fails."""
         self.active = False
         self._attempt(self.deactivate)
+        self.get_logger().info('deactivated')
         return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:

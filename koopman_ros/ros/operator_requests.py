@@ -43,8 +43,8 @@ class OperatorRequests:
         for places in (wiring.setpoints, wiring.joint_setpoints):
             SignalSubscriber(node, endpoints.subscribe, places, wiring.signals.states,
                              self._on_setpoints)
-        SignalSubscriber(node, endpoints.subscribe, wiring.manual, wiring.signals.inputs,
-                         self._on_manual)
+        self._manual = SignalSubscriber(
+            node, endpoints.subscribe, wiring.manual, wiring.signals.inputs, self._on_manual)
         SignalSubscriber(node, endpoints.subscribe, wiring.late, wiring.signals.every,
                          self._on_analysis)
         node.create_service(SetBool, '~/set_automatic', self._on_set_automatic)
@@ -54,6 +54,15 @@ class OperatorRequests:
     def complaint(self) -> str:
         """Why the last request was rejected or limited, for a minute; or an empty string."""
         return self._note if time.monotonic() - self._noted < _SHOWN else ''
+
+    @property
+    def sender_gone(self) -> str:
+        """Warning that manual commands have lost their sender, or an empty string."""
+        state = self._loop.state
+        return '' if (state.mode is not Mode.MANUAL or state.manual_input is None
+                      or self._manual.published()) else (
+            'the sender of the manual commands has gone: the last one stays applied; send another '
+            'one, or switch to automatic mode')
 
     def _on_setpoints(self, received: SignalSample) -> None:
         # only a stamp of the sender schedules it

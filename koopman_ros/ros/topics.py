@@ -217,11 +217,15 @@ class EndpointMonitor:
     def _conflict(self, topic: str) -> str:
         # who publishes something else is not in conflict; a node may be there twice
         kinds = {type_name(own.msg_type) for own in self._own
-                 if own.topic_name == self._node.resolve_topic_name(topic)}
+                 if own.topic_name == self._node.resolve_topic_name(topic)} | {
+            type_name(kind) for name, kind in TYPES.items() if name == topic}
         names = sorted(node_name(info) for info in self._node.get_publishers_info_by_topic(topic)
                        if info.topic_type in kinds)
+        # a crashed node is known until its lease has expired
+        died = ', unless one has died just now' * (len(set(names)) < len(names))
         return '' if len(names) < 2 else (
-            f'{len(names)} nodes {self._exclusive[topic]}: {", ".join(names)}; stop all but one')
+            f'{len(names)} nodes {self._exclusive[topic]}: {", ".join(names)}; stop all but one'
+            f'{died}')
 
     def _complaints(self, own: Publisher | Subscription) -> list[str]:
         topic, kind = own.topic_name, type_name(own.msg_type)

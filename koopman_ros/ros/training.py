@@ -142,7 +142,7 @@ class Training:
         self._job = None
         log = self._node.get_logger()
         # a line each, because rclpy allows one severity a line
-        if self._state.accepted:
+        if self._state.accepted or self._state.cancelled:
             log.info(self._state.text)
         elif self._state.rejected:
             log.warning(self._state.text)
@@ -165,5 +165,6 @@ class Training:
             # the sentence stays while the figures move, or there would be a status a step
             return TaskReport(Severity.OK, state.text.split(',')[0],
                               {**values, 'step': state.text})
-        return TaskReport(Severity.OK if state.accepted else Severity.WARN if state.rejected else
-                          Severity.ERROR, state.text, values)
+        return TaskReport(
+            Severity.OK if state.accepted or state.cancelled else
+            Severity.WARN if state.rejected else Severity.ERROR, state.text, values)

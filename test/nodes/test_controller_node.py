@@ -13,6 +13,7 @@ import time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, Temperature
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
@@ -22,7 +23,7 @@ from koopman_ros.demo import reactor
 from koopman_ros.event_log.records import EventRecord, parse, SNAPSHOT
 from koopman_ros.model import load, save
 from koopman_ros.nodes.controller import ControllerNode
-from koopman_ros.ros import signals, topics
+from koopman_ros.ros import controller_status, signals, topics
 from koopman_ros.testing import Harness
 from support.controller_bench import Bench, PURE, reproduced, STATUS, STEADY
 from support.nodes import RunNode, seconds, temperature, TIMEOUT, until_read, value
@@ -452,3 +453,36 @@ def test_a_measured_disturbance_that_fails_is_a_warning_and_the_loop_runs_on(
     assert value(status, 'active law') == 'learned law'
     assert float(value(status, 'feed_temperature [degC]')) == pytest.approx(79.5)
     reproduced(recorded)
+
+
+def test_a_sender_of_manual_commands_that_has_gone_is_a_warning(bench: Bench) -> None:
+    manual = bench.ros.speak(Temperature, reactor.MANUAL_COOLANT_SETPOINT, to='controller')
+    assert bench.ros.set_bool('controller/set_automatic', False).success
+    manual.publish(temperature(20.0))
+    bench.ros.wait_until(lambda: bench.commands[-1].temperature == pytest.approx(20.0))
+    bench.ros.wait_for_status('controller: requests', lambda s: s.level == DiagnosticStatus.OK)
+    bench.ros.node.destroy_publisher(manual)
+    bench.ros.wait_for_status('controller: requests', lambda s: (
+        s.level == DiagnosticStatus.WARN and 'has gone' in s.message))
+    assert bench.ros.set_bool('controller/set_automatic', True).success
+    bench.ros.wait_for_status('controller: requests', lambda s: s.level == DiagnosticStatus.OK)
+
+
+def test_of_two_clocks_one_may_have_died_and_diagnostics_have_their_time(
+        ros: Harness, run_node: RunNode, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(controller_status, '_PATIENCE', 0.5)
+    clocks = [ros.node.create_publisher(Clock, '/clock', topics.CLOCK_QOS) for _ in range(2)]
+    arrays = ros.listen(DiagnosticArray, '/diagnostics')
+    run_node(ControllerNode, {'use_sim_time': True})
+    seconds = itertools.count(1000)
+
+    def said(task: str, words: str) -> bool:
+        clocks[0].publish(Clock(clock=temperature(0.0, next(seconds)).header.stamp))
+        status = ros.last_status(f'controller: {task}')
+        return status is not None and words in status.message
+
+    ros.wait_until(lambda: said('connections', '2 nodes publish the time: /bench, /bench'))
+    ros.wait_until(lambda: said('connections', 'has died'))
+    # no measurement that is old, as there was none
+    ros.wait_until(lambda: said('measurements', 'no measurement was received for'))
+    ros.wait_until(lambda: arrays and arrays[-1].header.stamp.sec >= 1000)

@@ -6,6 +6,7 @@
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
+import re
 from typing import Any
 
 from lifecycle_msgs.msg import Transition
@@ -210,6 +211,8 @@ def test_controller(ros: Harness, tmp_path: Path) -> None:
     assert change(ros, 'controller', 'shutdown')
     assert ros.wait_for_end(process) == 0
     assert 'Traceback' not in process.output()
+    assert [re.sub('.* ', '', line) for line in process.output().splitlines() if re.search(
+        r'\[INFO\].*activated', line)] == ['activated', 'deactivated'] * 2
 
 
 def test_a_restarted_controller_continues_from_the_last_command(ros: Harness) -> None:

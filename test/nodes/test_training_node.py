@@ -123,8 +123,10 @@ def test_training_runs_while_the_loop_runs(ros: Harness, tmp_path: Path) -> None
     (child,) = children(process.process.pid)
     response = ros.trigger('trainer/cancel_training')
     assert (response.success, response.message) == (True, 'the training is being cancelled')
-    ros.wait_for_status(STATUS, lambda status: status.level == DiagnosticStatus.ERROR
+    ros.wait_for_status(STATUS, lambda status: status.level == DiagnosticStatus.OK
                         and status.message == 'cancelled; nothing was written')
+    ros.wait_until(lambda: re.search(
+        r'\[INFO\].*: cancelled; nothing was written', process.output()))
     assert ended(child)
     response = ros.trigger('trainer/cancel_training')
     assert (response.success, response.message) == (False, 'not training')

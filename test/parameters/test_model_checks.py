@@ -22,8 +22,9 @@ from koopman_ros.parameters.model_checks import (
     ModelCheckContext,
     reject_setpoints,
     reject_without_law,
+    rests_outside,
 )
-from koopman_ros.parameters.signal_topics import signals_of
+from koopman_ros.parameters.signal_topics import bundled_plants, plant_defaults, signals_of
 
 SHIPPED = load(model_path('reactor_nz4'))
 TABLE = table_of(SHIPPED)
@@ -131,3 +132,10 @@ def test_a_controller_is_built_for_states_of_nanoamperes() -> None:
     settings = table.snapshot({})
     assert table.check(settings) == ''
     assert built(settings, tiny).tuning.state_weight == pytest.approx(1.0 / tiny.states.scale ** 2)
+
+
+@pytest.mark.parametrize('system', bundled_plants())
+def test_the_safe_inputs_of_shipped_plants_keep_them_within_reach(system: str) -> None:
+    model = load(model_path(plant_defaults(system, 'controller')['model']))
+    table = table_of(model, {'system': system})
+    assert rests_outside(built(table.snapshot({}), model)) == ''
