@@ -5,10 +5,13 @@
 
 from glob import glob
 import os
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
 PACKAGE = 'koopman_ros'
+MANIFEST = ElementTree.parse(os.path.join(os.path.dirname(os.path.abspath(__file__)),
+                                          'package.xml')).getroot()
 TRAIN = ['torch==2.13.0', 'cloudpickle', 'joblib', 'tqdm']
 
 
@@ -29,10 +32,11 @@ def _data_files() -> list[tuple[str, list[str]]]:
 
 setup(
     name=PACKAGE,
-    version='0.1.0',
+    version=MANIFEST.findtext('version'),
     description='Control of nonlinear plants by learned linear representations, on ROS 2',
-    maintainer='The koopman_ros developers',
-    maintainer_email='no-mailbox@koopman-ros.invalid',
+    maintainer=MANIFEST.findtext('maintainer'),
+    maintainer_email=MANIFEST.find('maintainer').get('email'),
+    project_urls={url.get('type'): url.text for url in MANIFEST.findall('url')},
     license='Apache-2.0',
     packages=find_packages(include=[PACKAGE, PACKAGE + '.*']),
     package_data={PACKAGE: ['py.typed', 'export/templates/*', 'panel/*.css', 'panel/*.html',

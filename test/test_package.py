@@ -9,6 +9,7 @@ import functools
 import importlib.metadata
 from pathlib import Path
 import re
+import subprocess
 import sys
 import tomllib
 import xml.etree.ElementTree as ElementTree
@@ -68,9 +69,7 @@ def _names(path: Path) -> tuple[set[str], list[str]]:
 
 def test_versions_agree_and_the_manifest_is_of_format_3_and_names_real_people() -> None:
     manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
-    setup = re.search(r"version='([^']+)'", (ROOT / 'setup.py').read_text())
-    assert setup is not None
-    assert manifest.findtext('version') == koopman_ros.__version__ == setup.group(1)
+    assert manifest.findtext('version') == koopman_ros.__version__
     # as ROS tools read it: changes that are not released yet are first
     assert re.search(r'^(Forthcoming|\d+\.\d+\.\d+ \(\d{4}-\d{2}-\d{2}\))\n-+$',
                      (ROOT / 'CHANGELOG.rst').read_text(), re.MULTILINE)
@@ -83,7 +82,27 @@ def test_versions_agree_and_the_manifest_is_of_format_3_and_names_real_people() 
     for person in people:
         assert 'example' not in (person.get('email') or '')
         assert 'koopman_ros' in (person.text or '')
-    assert manifest.findtext('url', '').startswith('https://')
+    urls = {url.get('type'): url.text or '' for url in manifest.findall('url')}
+    assert set(urls) == {'repository', 'bugtracker', 'website'}
+    assert all(url.startswith('https://') for url in urls.values())
+
+
+@pytest.mark.filterwarnings('ignore::DeprecationWarning')
+def test_a_debian_package_needs_no_key_that_pip_installs() -> None:
+    manifest = parse_package(ROOT / 'package.xml')
+    manifest.evaluate_conditions({'KOOPMAN_ROS_WITHOUT_PIP': '1'})
+    assert not {one.name for one in manifest.exec_depends if one.evaluated_condition} & {
+        *_keys()['pip']}
+
+
+def test_metadata_of_the_distribution_are_those_of_the_manifest() -> None:
+    manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
+    found = subprocess.run(
+        [sys.executable, 'setup.py', '--version', '--maintainer', '--maintainer-email'], cwd=ROOT,
+        capture_output=True, text=True, check=True).stdout.splitlines()[-3:]
+    maintainer = manifest.find('maintainer')
+    assert maintainer is not None
+    assert found == [manifest.findtext('version'), maintainer.text, maintainer.get('email')]
 
 
 def _keys() -> dict[str, dict[str, list[str]]]:
