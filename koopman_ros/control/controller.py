@@ -14,6 +14,7 @@ import numpy as np
 from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.bumpless import with_step
 from koopman_ros.control.fallback import FallbackLevel
+from koopman_ros.control.margin import delay_margin
 from koopman_ros.control.recovery import rest_under, RestState
 from koopman_ros.control.state import Mode, State
 from koopman_ros.control.step import ControlStep
@@ -24,7 +25,7 @@ from koopman_ros.core.plugins import contained
 from koopman_ros.core.signals import numbers
 from koopman_ros.core.status import Reason, reason, StatusCode, UNMEASURED
 from koopman_ros.core.units import NANOSECONDS, nanoseconds
-from koopman_ros.estimation import equivalent_bias, Estimate, History
+from koopman_ros.estimation import DisturbanceObserver, equivalent_bias, Estimate, History
 
 
 @dataclass(frozen=True)
@@ -234,6 +235,40 @@ class Controller(ControlStep):
                            setpoint=state.setpoint if same else setpoints.Setpoint())
 
     # Questions about the loop.
+
+    def __str__(self) -> str:
+        """Show levels, estimator, signals, delay margin, and a tuning that has no effect."""
+        margin, bandwidth = self.delay_margin, self.tuning.observer_bandwidth
+        estimator = self.best.estimator
+        lines = [f'controller of {self.model.provenance.plant or self.model.kind}',
+                 f'laws, best first: {", ".join(self.levels)}',
+                 f'estimator: {type(estimator).__name__}',
+                 f'measured: {", ".join(self.measured.names)}',
+                 f'controlled: {", ".join(self.controlled.names)}',
+                 f'delay margin at a sample every {self.model.sample_interval:.3g} s: '
+                 + ('not calculated' if math.isnan(margin) else 'no limit' if math.isinf(margin)
+                    else f'{margin:.3g} s')]
+        if bandwidth > 0.0 and not isinstance(estimator, DisturbanceObserver):
+            lines.append(f'observer_bandwidth = {bandwidth:g} 1/s has no effect on this '
+                         'estimator: set disturbance_noise')
+        return '\n  '.join(lines)
+
+    @cached_property
+    def delay_margin(self) -> float:
+        """
+        Return the delay in s beyond the known one with which the loop becomes unstable.
+
+        Of the best law at the nominal point, at the sample interval of the training record; see
+        :func:`koopman_ros.control.margin.delay_margin`. NaN where it is not known.
+        """
+        try:
+            with np.errstate(all='ignore'):
+                return delay_margin(
+                    self.usable, self.measured, max(self.estimation.dead_ns, default=0)
+                    / NANOSECONDS, self.model.sample_interval)
+        except BaseException as error:
+            contained(error)
+            return math.nan
 
     @cached_property
     def usable(self) -> FallbackLevel:

@@ -38,19 +38,13 @@ def check_interval(model: LiftedModel, before: float, interval: float, share: fl
     Warn where measurements begin to come much closer together than in the training record.
 
     :param before: usual seconds between measurements so far, and `interval` with this one.
-    :param share: of the interval of the record that is much closer; stamps in microseconds that
-        are given as nanoseconds have a thousandth of it. For a model without a record, a tenth of
-        its fastest time constant is taken in place of that interval.
+    :param share: of :attr:`LiftedModel.sample_interval` that is much closer; stamps in
+        microseconds that are given as nanoseconds have a thousandth of it.
     """
-    recorded = model.provenance.metrics.get('sample_interval', 0.0)
-    fastest = model.linearised.fastest_rate / model.seconds_per_time_unit
-    usual = recorded or (0.1 / fastest if fastest > 0.0 else 0.0)
-    if interval < share * usual <= before:
+    if interval < share * model.sample_interval <= before:
         warnings.warn(
-            f'measurements are {interval:.3g} s apart, in the training record they were '
-            f'{recorded:.3g} s apart: check that stamps are in nanoseconds' if recorded else
-            f'measurements are {interval:.3g} s apart, the fastest time constant of the model is '
-            f'{1.0 / fastest:.3g} s: check that stamps are in nanoseconds', stacklevel=3)
+            f'measurements are {interval:.3g} s apart, the model is made for '
+            f'{model.sample_interval:.3g} s: check that stamps are in nanoseconds', stacklevel=3)
 
 
 def usual_interval(state: State) -> float:

@@ -25,7 +25,7 @@ from koopman_ros.estimation.base import (
     LOST,
     predicted_state,
 )
-from koopman_ros.estimation.dead_time import largest_bandwidth
+from koopman_ros.estimation.dead_time import default_bandwidth
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
@@ -58,25 +58,26 @@ def uncertainty(model: LiftedModel, outputs: Outputs, tuning: Tuning
         f'noise_{name}' if len(names) > 1 else 'noise', 0.0) if name in names else 0.0
         for name in outputs.names])
     half = 0.5 * (model.states.upper - model.states.lower)
-    slowest = float(np.min(np.abs(np.linalg.eigvals(
-        model.drift_jacobian(np.zeros(model.n_x)))))) / model.seconds_per_time_unit
+    modes = np.linalg.eigvals(model.linearised.A) / model.seconds_per_time_unit
+    slowest = float(np.min(np.abs(modes)))
     disturbance_noise = _WANDER * 0.5 * (model.inputs.upper - model.inputs.lower) * math.sqrt(
         max(slowest, 1.0 / _LONGEST))
     noise = np.where(tuning.measurement_noise > 0.0, tuning.measurement_noise, np.where(
         recorded > 0.0, recorded, _NOISE * np.abs(outputs.C) @ half))
     # the error of a value that is not reported is uniformly distributed
     noise = np.hypot(noise, tuning.sensor.unreported / math.sqrt(3.0))
-    dead_time = float(np.max(tuning.dead_times(model), initial=0.0))
-    if dead_time > 0.0:
-        # at one sample a second the bandwidth of a filter is the root of the ratio between the
-        # rate of an output that a disturbance causes and the output's noise; its poles are damped
-        # by 0.7, so that a disturbance settles as with an observer of the root of twice of that
+    bandwidth = default_bandwidth(modes, float(np.max(tuning.dead_times(model), initial=0.0)))
+    if math.isfinite(bandwidth):
+        # the squared bandwidth of a filter is the ratio between the rate of an output that a
+        # disturbance causes and the output's noise, by the root of the sample interval. With a
+        # third of the squared bandwidth of an observer, which takes most of a measurement for the
+        # state, the loop keeps at least that observer's delay margin
         rates = np.abs(outputs.C * model.states.scale @ effect_of_inputs(model)) / (
             model.inputs.scale * model.seconds_per_time_unit)
         with np.errstate(divide='ignore'):
             disturbance_noise = np.minimum(
-                disturbance_noise, 0.5 * largest_bandwidth(dead_time, slowest) ** 2 * np.min(
-                    noise[:, None] / rates, axis=0))
+                disturbance_noise, bandwidth ** 2 / 3.0 * math.sqrt(
+                    model.sample_interval) * np.min(noise[:, None] / rates, axis=0))
     guess = _GUESS * half
     # an applied input that is not measured follows from the commands
     guess[[i for i in model.lagged.values() if not outputs.C[:, i].any()]] = 0.0

@@ -245,6 +245,17 @@ class LiftedModel:
             found[j] = -self.seconds_per_time_unit / slope[i, i]
         return found
 
+    @cached_property
+    def sample_interval(self) -> float:
+        """
+        Time in s between the samples of the training record.
+
+        For a model without a record a tenth of its fastest time constant, at most 1 s.
+        """
+        fastest = self.linearised.fastest_rate / self.seconds_per_time_unit
+        return self.provenance.metrics.get('sample_interval') or (
+            1.0 if fastest <= 0.1 else 0.1 / fastest)
+
     @property
     def plant(self) -> PlantDescription:
         """The names, units and nominal point of its plant, without B."""

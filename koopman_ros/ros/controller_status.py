@@ -356,6 +356,7 @@ def _figures(now: StatusContext, condition: str) -> dict[str, object]:
         'predicted growth per sample': float(law.growth),
         **labelled(inputs, 'transfer', transfer, difference=True),
         **labelled(dict.fromkeys(inputs, 's'), 'dead time', dead_times),
+        'delay margin [s]': now.controller.delay_margin,
         'effect of inputs before the start ends in [s]': now.controller.estimation.assumed(state),
         'scheduled set-points': len(state.setpoint.scheduled),
         'measurements': now.counts.measurements,

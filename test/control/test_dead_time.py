@@ -160,8 +160,8 @@ def test_a_mode_too_fast_to_predict_over_the_dead_time_is_a_failure_of_the_level
 
 
 @pytest.mark.parametrize(('known', 'given', 'bandwidth'), [
-    (0.0, {}, 0.1), (5.0, {}, 0.1), (40.0, {}, 0.023), (40.0, {'dead_time': 0.0}, 0.1),
-    (0.0, {'dead_time': 80.0}, 0.013), (40.0, {'dead_time': -1.0}, 0.023),
+    (0.0, {}, 0.1), (5.0, {}, 0.1), (40.0, {}, 0.034), (40.0, {'dead_time': 0.0}, 0.1),
+    (0.0, {'dead_time': 80.0}, 0.02), (40.0, {'dead_time': -1.0}, 0.034),
     (40.0, {'observer_bandwidth': 0.1}, 0.1)])
 def test_the_default_bandwidth_falls_with_the_dead_time(known, given, bandwidth):
     model = replace(REACTOR_MODEL, dead_time=np.array([known]))
@@ -185,7 +185,7 @@ def test_the_default_noise_of_a_filter_falls_with_the_dead_time():
         limited = uncertainty(model, outputs, loop.tuning)[1]
         assert limited < usual
         assert limited == pytest.approx(
-            0.5 * largest_bandwidth(seconds, slowest) ** 2 * noise / gain)
+            largest_bandwidth(seconds, slowest) ** 2 / 3.0 * noise / gain)
         own = replace(loop.tuning, disturbance_noise=np.array([3.0]))
         np.testing.assert_array_equal(uncertainty(model, outputs, own)[1],
                                       uncertainty(loop.model, outputs, own)[1])
