@@ -96,18 +96,18 @@ def held_means(edges: Array, values: Array, times: Array) -> Array:
 
 def default_bandwidth(modes: ArrayLike, dead_time: float) -> float:
     """
-    Return the bandwidth in 1/s with which disturbances are estimated unless it is tuned.
+    Return the bandwidth in 1/s whose delay margin a filter keeps unless it is tuned.
 
-    That is the fastest mode, behind a dead time at most :func:`largest_bandwidth`.
+    That is the fastest mode, or, behind a dead time, :func:`largest_bandwidth`.
 
     :param modes: eigenvalues of the model in 1/s.
     :param dead_time: the longest of the inputs, in s.
     :return: infinity for an unstable plant without dead time, which cannot wait.
     """
-    sizes, stable = np.abs(modes), bool(np.all(np.real(modes) < 0.0))
-    fastest = float(np.max(sizes)) if stable else math.inf
-    return fastest if dead_time == 0.0 else min(
-        fastest, largest_bandwidth(dead_time, float(np.min(sizes))))
+    sizes = np.abs(modes)
+    if dead_time > 0.0:
+        return largest_bandwidth(dead_time, float(np.min(sizes)))
+    return float(np.max(sizes)) if np.all(np.real(modes) < 0.0) else math.inf
 
 
 def largest_bandwidth(dead_time: float, slowest: float) -> float:

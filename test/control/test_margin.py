@@ -120,10 +120,12 @@ def test_a_load_step_behind_a_dead_time_costs_no_more_than_with_a_tuned_pi_contr
 @pytest.mark.parametrize('dead_time', [0.0, 30.0])
 def test_a_filter_has_by_default_at_least_the_margin_of_the_observer(interval, dead_time):
     model = first_order(1.0 / 60.0, 1.0 / 120.0, interval, dead_time)
-    table = table_of(model, {'system': ''})
-    observer, kalman = (built(table.amended(table.snapshot({}), estimator=name), model)
-                        for name in ('disturbance_observer', 'extended_kalman_filter'))
-    assert kalman.delay_margin >= observer.delay_margin > 60.0
+    bandwidth = 1.0 / 60.0 if dead_time == 0.0 else largest_bandwidth(dead_time, 1.0 / 60.0)
+    observer, kalman = (Controller(model, Tuning.for_model(model, estimator=name, **given))
+                        for name, given in (
+                            ('disturbance_observer', {'observer_bandwidth': bandwidth}),
+                            ('extended_kalman_filter', {})))
+    assert kalman.delay_margin >= observer.delay_margin > max(30.0, dead_time)
 
 
 @pytest.mark.parametrize('name', ['two_tanks', 'fed_reactor', 'reactor_nz4'])
