@@ -5,8 +5,8 @@
 # # The logs of a heater board
 #
 # A board has a heater and a thermometer. The logger reads the thermometer and notes the heater's
-# command every 3 s, and resolves 0.1 °C. The command reaches the heater 6 s late. The thermometer
-# has a time constant of 20 s, so the temperature of the heater itself is not measured. The heater
+# command every 3 s, and resolves 0.1 °C. The command reaches the heater 15 s late. The thermometer
+# has a time constant of 12 s, so the temperature of the heater itself is not measured. The heater
 # loses heat by convection and by radiation.
 #
 # The board is simulated here, on two days of about 21 °C and on a colder one, and its three logs
@@ -22,10 +22,10 @@ import pandas as pd
 # a notebook has arguments of its own
 OUT = Path(*[word for word in sys.argv[1:2] if word[0] != '-'] or ['out/tutorials'])
 OUT.mkdir(parents=True, exist_ok=True)
-PERIOD, STEP, DEAD_TIME = 3.0, 0.1, 6.0  # s
+PERIOD, STEP, DEAD_TIME = 3.0, 0.1, 15.0  # s
 POWER = 5.0  # W at 100 %
 CAPACITY, CONVECTION, RADIATION = 12.0, 0.04, 1.5e-10  # J/K, W/K, W/K^4
-THERMOMETER, NOISE = 20.0, 0.05  # s, K
+THERMOMETER, NOISE = 12.0, 0.05  # s, K
 
 # %% [markdown]
 # ## A day
