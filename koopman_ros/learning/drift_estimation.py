@@ -21,10 +21,10 @@ from koopman_ros.learning.identification import (
     find_lags,
     IdentificationMethod,
     Identified,
+    identify_measured,
     identify_non_affine,
     identify_structure,
     identify_unmeasured,
-    identify_with_characteristics,
     lagged,
     with_lag,
 )
@@ -108,9 +108,8 @@ def _identify(task: TrainingTask, plant: PlantDescription, episodes: list[Episod
     if task.unmeasured_states > 0:
         return identify_unmeasured(plant, episodes, task.unmeasured_states, seed=seed,
                                    watch=watch, backend=backend, dead_times=not task.dead_time)
-    return identify_with_characteristics(
-        plant, episodes, given=given, methods=methods, seed=seed, watch=watch,
-        backend=backend)
+    return identify_measured(plant, episodes, given=given, methods=methods, seed=seed, watch=watch,
+                             backend=backend)[0]
 
 
 def _check_disturbances(plant: PlantDescription, episodes: Sequence[Episode]) -> None:

@@ -139,7 +139,8 @@ def _estimated(found: Identified, plant: PlantDescription) -> tuple[PlantDescrip
     within = (nominal > lower) & (nominal < upper)
     x, u = steady_point(found.drift, np.where(within, nominal, 0.5 * (lower + upper)),
                         np.where(np.isfinite(plant.nominal_input), plant.nominal_input,
-                                 found.drift.box.inputs.center))
+                                 found.drift.box.inputs.center),
+                        len(states) - found.hidden)
     drift = found.drift
     return replace(plant, state_names=states.names, state_units=states.units,
                    nominal_state=x, nominal_input=u, input_matrix_degree=0,

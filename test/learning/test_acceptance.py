@@ -366,6 +366,17 @@ def test_steady_point_keeps_a_state_that_an_input_can_hold():
     assert u == pytest.approx([-bent(1.2) / 1.5], abs=1e-11)
 
 
+def test_the_range_of_an_unmeasured_state_does_not_limit_a_steady_state():
+    # at rest the second state is 3
+    drift = DriftModel(box([-1.0, -1.0], [1.0, 1.0], [-1.0], [1.0]), 1,
+                       np.array([[0.0, -3.0], [-1.0, 0.0], [0.0, 1.0]]), np.eye(2, 1))
+    with pytest.raises(ValueError, match='no steady state'):
+        steady_point(drift, np.zeros(2), np.zeros(1))
+    x, u = steady_point(drift, np.zeros(2), np.zeros(1), 1)
+    assert drift.rate(x, u) == pytest.approx(0.0, abs=1e-9)
+    assert x[1] == pytest.approx(3.0)
+
+
 def test_steady_point_of_two_states_and_one_input():
     """Of dx1/dt = -x1 + x2 and dx2/dt = -x2 - x1^2 + u, on a box of half-widths 2 and 4."""
     drift = drift_model(

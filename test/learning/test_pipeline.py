@@ -73,7 +73,7 @@ def accepted(bag, tmp_path_factory):
 def estimated(accepted, monkeypatch):
     """Let a retraining go on from what the accepted one has estimated."""
     monkeypatch.setattr(
-        drift_estimation, 'identify_with_characteristics', lambda *_, **__: accepted[0].found)
+        drift_estimation, 'identify_measured', lambda *_, **__: (accepted[0].found, ()))
 
 
 @pytest.fixture
@@ -175,7 +175,7 @@ def test_models_of_alternative_drifts_are_kept_next_to_the_model(
             replace(drift, degree=33, coefficients=np.pad(
                 drift.coefficients, ((0, 34 - len(drift.coefficients)), (0, 0))))))
     monkeypatch.setattr(
-        drift_estimation, 'identify_with_characteristics', lambda *_, **__: found)
+        drift_estimation, 'identify_measured', lambda *_, **__: (found, ()))
     (tmp_path / 'new.alternative_7.safetensors').touch()
     told = []
     retrained = retrain(small(bag, tmp_path / 'new.safetensors'),

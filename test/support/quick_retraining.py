@@ -16,7 +16,7 @@ from koopman_ros.learning import (
     evaluate_model,
     pipeline,
 )
-from koopman_ros.learning.identification import identify_with_characteristics, structure_search
+from koopman_ros.learning.identification import identify_measured, structure_search
 from koopman_ros.learning.report import _sections
 from support.known_plants import methods
 
@@ -28,7 +28,7 @@ def quick_retraining(loops: int, degrees: tuple[int, ...] = (1, 3),
     fewer = {'degrees': degrees, 'methods': methods(*windows)}
     with pytest.MonkeyPatch.context() as patch:
         for original, *modules in (
-                (identify_with_characteristics, drift_estimation, structure_search),
+                (identify_measured, drift_estimation, structure_search),
                 (drift_estimation.identify_non_affine, drift_estimation)):
             def quick(*given, _original=original, **others):
                 return _original(*given, **{**others, **fewer})

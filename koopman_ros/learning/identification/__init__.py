@@ -15,7 +15,10 @@ from koopman_ros.learning.identification.base import (
     IdentificationMethod,
     methods_of,
 )
-from koopman_ros.learning.identification.characteristics import identify_with_characteristics
+from koopman_ros.learning.identification.characteristics import (
+    identify_measured,
+    identify_with_characteristics,
+)
 from koopman_ros.learning.identification.dead_time import DeadTimes, find_dead_times
 from koopman_ros.learning.identification.drift import (
     box_of,
@@ -51,6 +54,6 @@ __all__ = ['DeadTimes', 'Drift', 'DriftEstimate', 'DriftModel', 'DriftProblem', 
            'EstimatedConstant', 'IdentificationMethod', 'Identified', 'LaggedDrift', 'Score',
            'Segments', 'Stopped', 'TotalVariation', 'WeakForm', 'WeakFormParameters', 'box_of',
            'estimate_parameters', 'find_dead_times', 'find_lags', 'fitted_starts', 'identify',
-           'identify_non_affine', 'identify_structure', 'identify_unmeasured',
+           'identify_measured', 'identify_non_affine', 'identify_structure', 'identify_unmeasured',
            'identify_with_characteristics', 'lagged', 'longest_step', 'methods_of', 'noise_level',
            'output_error', 'prediction_error', 'total_variation', 'weak_form', 'with_lag']

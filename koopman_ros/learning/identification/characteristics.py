@@ -86,6 +86,26 @@ def identify_with_characteristics(plant: PlantDescription, episodes: Sequence[Ep
             f'characteristics do: if the model is rejected, {NonAffineDrift.remedy}'))
 
 
+def identify_measured(plant: PlantDescription, episodes: Sequence[Episode], *,
+                      given: Collection[str] = (), **options: Any
+                      ) -> tuple[Identified, Collection[str]]:
+    """
+    Estimate a drift as :func:`identify_with_characteristics`, whatever the effect of an input.
+
+    If the effect of one rises and falls, the inputs act linearly, with a warning.
+
+    :return: the estimate, and the inputs that may have a characteristic: where a state is not
+        measured, a rising effect may seem to fall.
+    """
+    try:
+        found = identify_with_characteristics(plant, episodes, given=given, **options)
+        return found, found.drift.characteristics.keys() - set(given)
+    except NotMonotoneError as error:
+        found = identify_with_characteristics(plant, episodes, given=plant.input_names, **options)
+        return replace(found, warnings=(*found.warnings, str(error))), (
+            set(plant.input_names) - set(given))
+
+
 def characteristic_of(found: Identified, name: str) -> Characteristic | None:
     """
     Return the characteristic of an input; None where the record does not need one.

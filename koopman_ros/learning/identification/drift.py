@@ -321,7 +321,8 @@ def fitted_starts(rate: Rate, segments: Segments, scale: Array) -> tuple[Array, 
     return scale * starts, scale ** 2 * squares / count
 
 
-def steady_point(drift: Drift, x: Array, u: Array) -> tuple[Array, Array]:
+def steady_point(drift: Drift, x: Array, u: Array, measured: int | None = None
+                 ) -> tuple[Array, Array]:
     """
     Find a steady state of the drift and its input near given ones.
 
@@ -330,10 +331,13 @@ def steady_point(drift: Drift, x: Array, u: Array) -> tuple[Array, Array]:
 
     :param x: (n_x,) in state units.
     :param u: (n_u,) in input units.
+    :param measured: number of the first states, which must be within the range; all by default.
+        The range of a state that nobody measures says nothing.
     """
     box, n_x = drift.box, len(x)
     y = np.concatenate((box.states.to_deviation(x), box.inputs.to_deviation(u)))
-    limit = np.where(np.arange(len(y)) < n_x, _SLIGHTLY_OUTSIDE, np.inf)
+    limit = np.where(np.arange(len(y)) < (n_x if measured is None else measured),
+                     _SLIGHTLY_OUTSIDE, np.inf)
     held = np.full(len(y), np.linalg.matrix_rank(drift.scaled_input_matrix(y[:n_x])) == n_x)
     held[n_x:] = False
     found = steady_state(

@@ -18,7 +18,7 @@ from koopman_ros.execution import Backend
 from koopman_ros.learning.identification.base import IdentificationMethod
 from koopman_ros.learning.identification.characteristics import (
     characteristic_of,
-    identify_with_characteristics,
+    identify_measured,
     NotMonotoneError,
 )
 from koopman_ros.learning.identification.data_split import SplitRecord
@@ -51,7 +51,7 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
     """
     Estimate a drift with as many states as free runs of the record need.
 
-    An estimate of measured states by :func:`identify_with_characteristics` is kept if its
+    An estimate of measured states by :func:`identify_measured` is kept if its
     simulations of the whole record err by little more than noise. Otherwise B(x) of degree 1 is
     tried, unless it has too many coefficients, and taken where free runs of the segments held out
     err less, and those of all by more than two standard errors. If the simulations then err by
@@ -63,19 +63,17 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
     :param given: inputs whose characteristic the plant has already.
     :param methods: see :func:`identify`; other arguments as for :func:`identify_unmeasured`.
     """
-    def estimate(plant: PlantDescription, given: Collection[str], before: int) -> Identified:
-        return identify_with_characteristics(
+    def estimate(plant: PlantDescription, given: Collection[str], before: int
+                 ) -> tuple[Identified, Collection[str]]:
+        return identify_measured(
             plant, episodes, given=given, methods=methods, seed=seed, backend=backend,
             watch=lambda done, total, text: watch(before * total + done, 5 * total, text))
 
     end = time.process_time() + BUDGET
-    try:
-        measured = estimate(plant, given, 0)
-        candidates = measured.drift.characteristics.keys() - set(given)
-    except NotMonotoneError:
-        # so it may seem where a state between input and measurement is not measured
-        measured = estimate(plant, plant.input_names, 0)
-        candidates = set(plant.input_names) - set(given)
+    measured, candidates = estimate(plant, given, 0)
+    # of an effect that rises and falls it says so last
+    doubt = measured.warnings[-1:] if (
+        candidates and not measured.drift.characteristics.keys() - set(given)) else ()
     plant = replace(plant, characteristics=measured.drift.box.inputs.characteristics)
     if callable(plant.B) or plant.input_matrix_degree or _explains(
             measured, plant, episodes, 0.0):
@@ -83,7 +81,7 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
     n_x, n_u = len(plant.state_names), len(plant.input_names)
     if plant.B is None and not plant.disturbance_names and (
             n_x * (1 + n_x) * (1 + n_u) <= MOST_COEFFICIENTS):
-        varying = estimate(replace(plant, input_matrix_degree=1), plant.input_names, 1)
+        varying, _ = estimate(replace(plant, input_matrix_degree=1), plant.input_names, 1)
         (own, held_out), (other, others) = map(free_run_errors, (varying, measured))
         better, words = compared(own, other)
         better &= bool(np.mean(held_out ** 2) < np.mean(others ** 2))
@@ -95,10 +93,12 @@ def identify_structure(plant: PlantDescription, episodes: Sequence[Episode], *,
     if candidates:
         plant = with_characteristics(plant, episodes, candidates, seed=seed, dead_times=dead_times,
                                       backend=backend)
-    return identify_unmeasured(
+    found = identify_unmeasured(
         plant, episodes, MOST_UNMEASURED, measured=measured, dead_times=dead_times, seed=seed,
         backend=backend, budget=max(0.0, end - time.process_time()),
         watch=lambda done, total, text: watch(2 * total + 3 * done, 5 * total, text))
+    return found if found.drift.characteristics.keys() - set(given) else replace(
+        found, warnings=tuple(dict.fromkeys((*found.warnings, *doubt))))
 
 
 def with_characteristics(plant: PlantDescription, episodes: Sequence[Episode],
@@ -113,9 +113,8 @@ def with_characteristics(plant: PlantDescription, episodes: Sequence[Episode],
                 if (one := characteristic_of(rough, name)) is not None:
                     found[name] = one
             except NotMonotoneError:
-                # one that was found before is kept
-                if name not in plant.characteristics:
-                    raise
+                # one that was found before is kept; any other input acts linearly
+                continue
         if not found:
             break
         plant = replace(plant, characteristics={**plant.characteristics, **found})

@@ -224,13 +224,10 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
                            steps=choice.ended(best), free_run=best.score.rmse,
                            searched=searched)
         try:
-            predictor = _with_gain(best, stage('gain of the filter', np.inf))
-            result = best.record.identified(
-                predictor, best.label, [one.score for one in choice.candidates],
-                stage('linear model', np.inf))
+            predictor, result = _identified(best, choice, stage)
             break
-        except ValueError:
-            # its filter diverges
+        except ValueError as error:
+            choice.steps.append(f'{best.text}: left out, {error}')
             able = [one for one in able if one is not best]
             if not able:
                 raise
@@ -250,6 +247,26 @@ def _nearly_equal(linear: StructureCandidate, others: Sequence[StructureCandidat
     return [one for one in others if abs(one.hidden - linear.hidden) == 1 and (
         one.score.cost <= NEARLY * linear.score.cost
         or not compared(linear.errors, one.errors)[0])]
+
+
+def _identified(best: StructureCandidate, choice: Choice,
+                stage: Callable[..., Callable[..., bool]]
+                ) -> tuple[Predictor[Drift], Identified]:
+    """
+    Return the best candidate with its states, as a filter estimates them, or its simulation.
+
+    :raises ValueError: when its simulation of the record diverges.
+    """
+    def result(predictor: Predictor[Drift]) -> tuple[Predictor[Drift], Identified]:
+        return predictor, best.record.identified(
+            predictor, best.label, [one.score for one in choice.candidates],
+            stage('linear model', np.inf))
+
+    try:
+        return result(_with_gain(best, stage('gain of the filter', np.inf)))
+    except ValueError:
+        # of a model that forgets its start the simulation shows the states, too
+        return result(Predictor(best.model.drift, np.zeros_like(best.gain)))
 
 
 def _with_gain(best: StructureCandidate, monitor: Callable[..., bool]) -> Predictor[Drift]:

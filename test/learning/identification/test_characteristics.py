@@ -14,6 +14,7 @@ from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.message_fields import place
 from koopman_ros.learning import retrain, TrainingTask
 from koopman_ros.learning.identification import (
+    identify_measured,
     identify_with_characteristics,
     structure_search,
 )
@@ -168,6 +169,14 @@ def test_one_that_is_given_is_kept():
 def test_an_effect_that_rises_and_falls_is_rejected():
     with pytest.raises(ValueError, match='valve rises and falls'):
         identified(record(lambda x, u: -x + u * u, -1.0, 1.0))
+
+
+def test_a_search_does_not_end_at_an_effect_that_rises_and_falls():
+    found, candidates = identify_measured(
+        PLANT, [record(lambda x, u: -x + u * u, -1.0, 1.0)], degrees=(1,), methods=methods(20))
+    assert any('valve rises and falls' in warning for warning in found.warnings)
+    assert not found.drift.characteristics
+    assert candidates == {'valve'}
 
 
 def test_a_drift_that_is_not_affine_in_the_input_competes():

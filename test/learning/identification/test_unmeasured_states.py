@@ -18,6 +18,7 @@ from koopman_ros.learning.identification import (
     identify_unmeasured,
     network_candidates,
     Stopped,
+    unmeasured_states,
 )
 from koopman_ros.learning.identification.network_drift import NetworkDrift
 from koopman_ros.learning.identification.polynomial_candidates import PolynomialSearch
@@ -132,6 +133,25 @@ def test_an_order_whose_simulations_diverge_is_said(monkeypatch):
     found = identify_unmeasured(PLANT, [record(oscillator, samples=400)], 2, budget=0.0)
     assert found.hidden == 2
     assert 'drift of degree 1 with 1 state not measured: diverges' in found.steps
+
+
+def test_a_model_is_not_dropped_because_its_filter_diverges(monkeypatch):
+    def diverges(*_):
+        raise ValueError('the estimate of the unmeasured states diverges')
+
+    monkeypatch.setattr(unmeasured_states, '_with_gain', diverges)
+    whole = record(oscillator, samples=400)
+    found = identify_unmeasured(PLANT, [whole], 1, highest_degree=1, networks=False,
+                                dead_times=False)
+    slope = found.drift.slope(found.drift.box.states.center)
+    assert np.sort_complex(np.linalg.eigvals(slope)) == pytest.approx(
+        np.sort_complex(np.linalg.eigvals(A)), rel=0.03)
+    # the unmeasured state is that of the simulation: it moves at its rate, without noise
+    for part in found.episodes:
+        held = part.inputs_at(part.time)[:-1]
+        begin, end = (found.drift.rate(x, held)[:, 1] for x in (part.x[:-1], part.x[1:]))
+        change = np.diff(part.x[:, 1]) / PERIOD
+        assert change == pytest.approx(0.5 * (begin + end), abs=0.3 * np.std(begin))
 
 
 def test_a_constant_disturbance_of_each_day_is_no_part_of_the_drift():
