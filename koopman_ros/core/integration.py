@@ -5,8 +5,8 @@
 Integration of dx/dt = f(x): fixed Runge-Kutta steps by one rule, and an adaptive reference.
 
 Fixed steps are those of filters, predictions, plans, trial loops and identification: they cost the
-same at every sample, also where a model is wrong. The adaptive pair simulates plants, and is what
-the fixed steps are tested against.
+same at every sample, also where a model is wrong. The adaptive pair simulates plants, and is the
+reference of tests of the fixed steps.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ class StepRule:
     How many fixed steps an interval takes.
 
     The local error of a Runge-Kutta step of order 4 is (h r)^5 / 120 of a mode of rate r: 3e-4 for
-    the longest step, below what a filter can tell from noise.
+    the longest step, below the noise that a filter sees.
     """
 
     time_constants: float = 0.5  #: longest step, as a share of the fastest local time constant

@@ -52,7 +52,7 @@ class Retrained:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the user should know of the record and of the model, in either case."""
+        """Warnings about the record and the model, accepted or not."""
         return (*self.account.warnings(), *(self.decision.warnings if self.decision else ()))
 
     @property

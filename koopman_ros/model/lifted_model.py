@@ -217,7 +217,7 @@ class LiftedModel:
 
     @cached_property
     def measured(self) -> list[int]:
-        """Indices of the states that are measured, unless a controller is told otherwise."""
+        """Indices of the states that are measured, unless a controller is given `outputs`."""
         return [i for i, name in enumerate(self.states.names) if (
             name in self.states_measured if self.states_measured
             else i not in self.lagged.values())]

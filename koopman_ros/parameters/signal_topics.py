@@ -391,7 +391,7 @@ def file_parameters(path: Path, node: str) -> dict[str, Any]:
     """
     Return the parameters of a node, by name, from a ROS parameter file.
 
-    :raises ValueError: for a file that is no parameter file.
+    :raises ValueError: for a file other than a parameter file.
     """
     content = _content(path)
     values: dict[str, Any] = {}

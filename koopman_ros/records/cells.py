@@ -91,7 +91,7 @@ def _number(cell: str, decimal: str, apart: bool) -> float:
         raise ValueError(f'has more than {_LONGEST} digits: correct it, or empty it')
     text = _GROUPED.sub(_joined, cell)
     if not decimal and re.search('[.,]', text):
-        raise ValueError('may have thousands or three decimals, and no other cell tells: write '
+        raise ValueError('may have thousands or three decimals, which no other cell shows: write '
                          'numbers as 1234.5')
     group = ',' if decimal == '.' else '.'
     if apart:

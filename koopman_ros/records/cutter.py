@@ -22,7 +22,7 @@ from koopman_ros.records.import_spec import break_notes, ImportReport
 
 @dataclass(frozen=True)
 class CuttingRules:
-    """What is no motion of a plant in a record."""
+    """Limits of a plant's motion in a record; larger changes are spikes, jumps or gaps."""
 
     gap_periods: float = 3.5  #: a longer time without a measurement, in usual periods, is a gap
     shortest: int = 10  #: samples of an episode
@@ -52,7 +52,7 @@ def spikes_and_jumps(values: Array, least: float = 0.0, rules: CuttingRules = RU
 
     A spike leaves the median of its neighbours (Hampel's identifier, by the median deviation of
     the record and of the neighbours), so that it is found whatever share of the record others
-    have. A jump is a change between two samples that are no spikes.
+    have. A jump is a large change between two samples neither of which is a spike.
 
     :param values: (n,) in the order of their times.
     :param least: no smaller change is one of them.
@@ -77,7 +77,7 @@ def spikes_and_jumps(values: Array, least: float = 0.0, rules: CuttingRules = RU
 
 
 def _large_changes(values: Array, least: float, rules: CuttingRules) -> NDArray[np.int64]:
-    """Return the signs of changes that are no motion, 0 for others."""
+    """Return the signs of changes too large for a motion, 0 for others."""
     change = np.diff(values)
     limit = max(rules.times_usual * float(np.percentile(np.abs(change), rules.usual)),
                 rules.share_of_range * _range(values, rules), least)

@@ -109,7 +109,7 @@ def read(source: Source, states: Names, inputs: Names, *, time: str = '', period
     :param linear: inputs that are linear from row to row, such as measurements of a slow actuator.
     :param tolerance: largest difference in s between the stamps of one sample in a bag.
     :param name: of the plant; by default that of the first file.
-    :param dayfirst: whether 1/2/2026 is 1 February, where no date of the column tells.
+    :param dayfirst: whether 1/2/2026 is 1 February, where the dates of the column leave it open.
     :raises BagReadError: for a bag that cannot be read.
     :raises ValueError: for a table that cannot be read, or whose times or numbers have more than
         one reading, with row, column and cell.

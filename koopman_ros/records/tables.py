@@ -130,7 +130,7 @@ class Table:
         """
         Return the numbers (R,) of a column, NaN for none.
 
-        :raises ValueError: naming the cell, where its number cannot be told.
+        :raises ValueError: naming the cell, where its number is ambiguous.
         """
         column, cells = self.frame[k], self.cells(k)
         if cells is None:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Text tables of loggers (CSV): where the headers are, and what stands above and below them."""
+"""Text tables of loggers (CSV): the lines of the headers, and those above and below them."""
 
 from __future__ import annotations
 

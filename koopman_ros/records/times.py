@@ -27,7 +27,7 @@ TIME_UNITS = {**_UNITS, **{unit: unit for unit in ('ns', 'us', 'ms', 's', 'min',
 
 @dataclass(frozen=True)
 class TimeRules:
-    """What numbers without a unit can be."""
+    """Ranges by which the unit of times without one is recognised."""
 
     #: s; numbers that span more are no seconds: no record is 30 years long
     longest: float = 1e9
@@ -80,7 +80,8 @@ def text_seconds(cells: Sequence[str], name: str, dayfirst: bool | None,
     Return dates or durations (R,) in s since the first one, NaN where there is none.
 
     :param dayfirst: whether 1/2 is 1 February; None where the column must tell.
-    :raises ValueError: for texts that are no times, or dates that leave day and month open.
+    :raises ValueError: for a text that cannot be read as a time, or dates that leave day and
+        month open.
     """
     import pandas as pd
     texts = pd.Series(list(cells), dtype=object)

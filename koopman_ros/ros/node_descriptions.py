@@ -182,7 +182,7 @@ def programs(given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Progr
                    'plant/reset',
                    *(f'trainer/{service}' for service in (
                        'record', 'experiment', 'train', 'cancel_training')),
-                   *(f'{node}/{service}' for node in ('controller', 'trainer')
+                   *(f'{node}/{service}' for node in ('controller', 'trainer', 'panel')
                      for service in TUNING_SERVICES))),
     }
 
