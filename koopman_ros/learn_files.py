@@ -50,6 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
         states, inputs, disturbances = _wanted(options, present)
         record, test = (read(files, states, [*inputs, *disturbances], time=options['time'],
                              period=options['period'], linear=options['linear'],
+                             dayfirst=options['dayfirst'],
                              tolerance=options.get('synchronisation_tolerance', 0.0))
                         if files else None for files in (options['record'], options['test']))
         assert record is not None
@@ -77,6 +78,8 @@ def command_parser() -> argparse.ArgumentParser:
         "'stamp [ms]'; by default the column time")
     add('--period', type=float, default=0.0, metavar='S',
         help='time between rows, in place of a column, in s')
+    add('--dayfirst', action=argparse.BooleanOptionalAction, default=None,
+        help='whether 1/2/2026 is 1 February, where the dates of the column leave it open')
     add('--linear', nargs='+', default=(), metavar='INPUT',
         help='inputs that are linear from row to row; others are held')
     add('--lag', nargs='+', default=(), metavar='INPUT=S', help='time constants with which inputs '

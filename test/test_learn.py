@@ -169,6 +169,19 @@ def test_a_wrong_argument_is_a_sentence(folder, capsys, arguments, words):
     assert words in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(('option', 'days'), [('--dayfirst', 11), ('--no-dayfirst', 334)])
+def test_an_option_says_which_number_of_a_date_is_the_day(tmp_path, capsys, option, days):
+    """1/2 to 12/2 are eleven days, or eleven months."""
+    file = tmp_path / 'log.csv'
+    file.write_text('time,level [m],pump [V]\n' + ''.join(
+        f'{number}/2/2026 00:00,{number}.5,1.0\n' for number in range(1, 13)))
+    arguments = [str(file), '--states', 'level', '--inputs', 'pump']
+    assert learn.main(arguments) == 1
+    assert option in capsys.readouterr().err
+    learn.main([*arguments, option])
+    assert f'12 samples in {86400 * days:.6g} s' in capsys.readouterr().out
+
+
 def test_the_module_is_the_program(tmp_path):
     found = subprocess.run(
         [sys.executable, '-m', 'koopman_ros.learn', 'day.csv'], capture_output=True, text=True,

@@ -107,7 +107,8 @@ def text_seconds(cells: Sequence[str], name: str, dayfirst: bool | None,
     elif dayfirst is None and len(set(zip(first.dropna(), second.dropna(), strict=True))) > 1 and (
             first != second)[first.notna()].any():
         raise ValueError(f'{texts[int(first.first_valid_index())]!r} in {name!r} may be month/day '
-                         'or day/month: give dayfirst=True or dayfirst=False')
+                         'or day/month: give dayfirst=True or dayfirst=False, on the command line '
+                         '--dayfirst or --no-dayfirst')
     with warnings.catch_warnings():
         # pandas finds the form by the first text, and looks at the others one by one
         warnings.simplefilter('ignore')
