@@ -98,7 +98,8 @@ def default_bandwidth(modes: ArrayLike, dead_time: float) -> float:
     """
     Return the bandwidth in 1/s whose delay margin a filter keeps unless it is tuned.
 
-    That is the fastest mode, or, behind a dead time, :func:`largest_bandwidth`.
+    That is the fastest mode, or, behind a dead time, half of :func:`largest_bandwidth`: a filter
+    corrects the state as well, and overshoots where the dead time is a tenth longer than known.
 
     :param modes: eigenvalues of the model in 1/s.
     :param dead_time: the longest of the inputs, in s.
@@ -106,7 +107,7 @@ def default_bandwidth(modes: ArrayLike, dead_time: float) -> float:
     """
     sizes = np.abs(modes)
     if dead_time > 0.0:
-        return largest_bandwidth(dead_time, float(np.min(sizes)))
+        return 0.5 * largest_bandwidth(dead_time, float(np.min(sizes)))
     return float(np.max(sizes)) if np.all(np.real(modes) < 0.0) else math.inf
 
 

@@ -100,7 +100,7 @@ def test_first_lift_is_accepted_and_brings_the_oven_to_its_set_point(
     ros.meet('controller')
     # the law alone, without noise: what is left is the error of the lift
     start(ros, overlay, RUN, '-p', 'speed:=0.0', '-p', 'plant:temperature.measurement_noise:=0.0')
-    ((topic, kind, content),) = re.findall(r"ros2 topic pub --once (\S+) (\S+) '(.*)'", PAGE)
+    ((topic, kind, content),) = re.findall(r"ros2 topic pub -w 1 --once (\S+) (\S+) '(.*)'", PAGE)
     asked = topics.message_class(kind)(**yaml.safe_load(content))
     ros.speak(type(asked), topic, to='controller').publish(asked)
     goal = asked.temperature
