@@ -55,7 +55,7 @@ def fastest_rate(jacobian: Array) -> float:
     """
     Return the size of the fastest mode of a Jacobian (n, n), at most some percent too large.
 
-    |J^8|^(1/8) bounds the spectral radius from above, by Gelfand's formula. It takes three
+    ``|J^8|^(1/8)`` bounds the spectral radius from above, by Gelfand's formula. It takes three
     products in place of eigenvalues, in C as here.
     """
     flat = jacobian.ravel()
