@@ -184,7 +184,7 @@ def test_the_default_noise_of_a_filter_falls_with_the_dead_time():
         gain = float((model.B[0, 0] * model.states.scale[0]) / 60.0)
         limited = uncertainty(model, outputs, loop.tuning)[1]
         assert limited == pytest.approx(
-            largest_bandwidth(seconds, slowest) ** 2 / 3.0 * noise / gain)
+            (0.5 * largest_bandwidth(seconds, slowest)) ** 2 / 3.0 * noise / gain)
         own = replace(loop.tuning, disturbance_noise=np.array([3.0]))
         np.testing.assert_array_equal(uncertainty(model, outputs, own)[1],
                                       uncertainty(loop.model, outputs, own)[1])
