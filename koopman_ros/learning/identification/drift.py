@@ -332,7 +332,7 @@ def steady_point(drift: Drift, x: Array, u: Array, measured: int | None = None
     :param x: (n_x,) in state units.
     :param u: (n_u,) in input units.
     :param measured: number of the first states, which must be within the range; all by default.
-        The range of a state that nobody measures says nothing.
+        The range of an unmeasured state is not a limit.
     """
     box, n_x = drift.box, len(x)
     y = np.concatenate((box.states.to_deviation(x), box.inputs.to_deviation(u)))
