@@ -271,7 +271,7 @@ class AnswerLine:
     def _expire(self, now: Snapshot) -> None:
         if not self._label.text:
             return
-        # what was asked for takes effect at first
+        # the request takes effect first
         if time.monotonic() - self._since < _SETTLED:
             self._held = self._basis(now)
         elif self._basis(now) != self._held:

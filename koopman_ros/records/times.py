@@ -31,7 +31,7 @@ class TimeRules:
 
     #: s; numbers that span more are no seconds: no record is 30 years long
     longest: float = 1e9
-    #: s since 1970 (1990 to 2100): the same times in ms, us and ns are told by their digits
+    #: s since 1970 (1990 to 2100): times in ms, us and ns have more digits
     epoch: tuple[float, float] = (6.3e8, 4.1e9)
     #: d since 1899-12-30 (2000 to 2100), as spreadsheets count
     serial_days: tuple[float, float] = (36526.0, 73050.0)

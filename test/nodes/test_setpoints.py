@@ -63,7 +63,7 @@ def test_each_of_two_setpoints_is_judged_with_what_was_requested(ros: Harness) -
     operator = Operator(ros)
     operator.ask(level_1=HIGH)
     operator.tracked({'level_1': HIGH})
-    # nobody requested the other one, which has to make room
+    # the other one was not requested, so it has to make room
     ros.wait_until(lambda: operator.level('level_2') > LOW + 0.01)
     assert 'makes room' in ros.processes[0].output()
     room = operator.level('level_2')
