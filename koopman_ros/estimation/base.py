@@ -138,9 +138,9 @@ def integration_steps(model: LiftedModel, estimate: Estimate, u: Array, seconds:
     """
     duration = seconds / model.seconds_per_time_unit
     local = fastest_rate(model.rate_and_slope(estimate.x, u)[1])
-    # a rate that is not a number must not be lost in a comparison
-    return duration, STEPS.count(duration, local if local > model.linearised.fastest_rate
-                                 or math.isnan(local) else model.linearised.fastest_rate)
+    # passes on a NaN, as the comparisons of Python do not
+    fastest = float(np.maximum(local, model.linearised.fastest_rate))
+    return duration, STEPS.count(duration, fastest)
 
 
 class Estimator(ABC):
