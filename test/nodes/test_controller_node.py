@@ -164,8 +164,6 @@ def test_manual_mode_sends_the_command_of_the_operator(bench: Bench) -> None:
     at, command = bench.settle(STEADY, at + 1.0)
     assert command == pytest.approx(held, abs=1e-6)
     assert bench.settle(STEADY + 1.0, at + 1.0)[1] < held - 0.3
-    # a test of a sender that has gone follows
-    bench.ros.node.destroy_publisher(manual)
 
 
 def test_limits_ramp_and_weights_change_while_the_loop_runs(bench: Bench) -> None:

@@ -64,11 +64,17 @@ def ros(tmp_path: Path) -> Iterator[Harness]:
 
 
 class SharedHarness(Harness):
-    """Remembers what the parameters of shared processes were before a test changed them."""
+    """Remembers parameters of shared processes, and own endpoints, from before each test."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder, timeout=TIMEOUT)
         self._before: dict[str, dict[str, ParameterValue]] = {}
+        self.remember_endpoints()
+
+    def remember_endpoints(self) -> None:
+        """Remember the publishers and subscriptions that the tests to come share."""
+        self._publishers = set(self.node.publishers)
+        self._subscriptions = set(self.node.subscriptions)
 
     def set_parameters(self, node: str, **values: Any) -> list[SetParametersResult]:
         before = self._values(node, values)
@@ -95,9 +101,14 @@ class SharedHarness(Harness):
                 first.setdefault(name, value)
 
     def restore(self) -> None:
-        """Set all parameters back; a node that a test has ended is gone."""
+        """Set all parameters back, and destroy endpoints that a test has made."""
+        for publisher in set(self.node.publishers) - self._publishers:
+            self.node.destroy_publisher(publisher)
+        for subscription in set(self.node.subscriptions) - self._subscriptions:
+            self.node.destroy_subscription(subscription)
         before, self._before = self._before, {}
         for node, values in before.items():
+            # a node that a test has ended is gone
             if not any(process.running for process in self.processes):
                 continue
             request = SetParametersAtomically.Request(parameters=[
@@ -124,11 +135,12 @@ def shared_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SharedHarne
 
 @pytest.fixture(autouse=True)
 def left_as_found(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Set back the parameters of shared processes, also after a test that failed."""
+    """Set back what a test changed of shared processes, also after one that failed."""
     if 'shared_ros' not in request.fixturenames:
         yield
         return
     shared = request.getfixturevalue('shared_ros')
+    shared.remember_endpoints()
     yield
     shared.restore()
 
