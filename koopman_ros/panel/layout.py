@@ -28,8 +28,8 @@ _TIMEOUT = 40.0  # s for an answer
 TABS = {'/': 'Overview', '/trends': 'Trends', '/alarms': 'Alarms', '/model': 'Model',
         '/tuning': 'Tuning', '/audit': 'Audit'}
 _CSS, _WATCH = ((files(__package__) / name).read_text() for name in ('style.css', 'watch.js'))
-_TEXTS = ('alt', 'aria-label', 'data-beat', 'data-parameter', 'data-present', 'data-signal',
-          'data-sound', 'data-title')
+_TEXTS = ('alt', 'aria-label', 'data-answered', 'data-beat', 'data-parameter', 'data-present',
+          'data-signal', 'data-sound', 'data-title')
 _SETTLED = 2.0  # s after which an answer no longer holds if the loop changes
 #: frequency of the sound in Hz, and symbol, of each priority
 SOUNDS = {Priority.HIGH: '880', Priority.MEDIUM: '660', Priority.LOW: '440'}

@@ -88,60 +88,60 @@ class _Entry:
     """
     Entry of a number: typed, stepped by the arrow keys, or moved by a slider.
 
+    The page itself sets what the field shows (watch.js), which it is told by two attributes of the
+    box: the present value, and the text that was answered last. What the panel sent to the field
+    could arrive while a person types.
+
     :param present: the requested value at present.
     """
 
     def __init__(self, page: PageLayout, title: str, send: Callable[[float], Any],
                  present: Callable[[Snapshot], float]) -> None:
-        self._page, self._send = page, send
-        self._shown = ''  # present value in the field until a user types
-        with box('ask') as self._box:
+        self._send = send
+        self._answered = ''
+        # disabled, it disables all that it holds
+        with box('ask', tag='fieldset').props('disabled') as self._box:
             self._field = page.control(ui.input(title).props(
                 'outlined dense inputmode=decimal autocomplete=off'))
-            self._button = page.control(attribute(
+            page.control(attribute(
                 ui.button('Set', on_click=self._submit).props('unelevated'), 'aria-label',
                 f'Set {title}'))
-            # the page itself keeps slider and field alike, and steps by the arrow keys
-            self._slider = attribute(ui.element('input').props('type=range disabled'),
-                                     'aria-label', f'{title}, slider')
+            self._slider = attribute(
+                ui.element('input').props('type=range'), 'aria-label', f'{title}, slider')
         self._answer = AnswerLine(page, lambda now: (
             now.mode, present(now), now.silent(PLANT), now.silent(CONTROLLER)))
         self._field.on('keydown.enter', self._submit)
-        self._field.on('keydown.escape', self._reset)
+        self._field.on('keydown.escape', lambda: self._answer.set_text(''))
 
     def show(self, face: Faceplate, present: float, obstacle: str) -> None:
         """
-        Follow the present value until a user types another one.
+        Let the field follow the present value until a user types another one.
 
         :param obstacle: why nothing can be sent, or empty.
         """
         low, high = (round(end, face.decimals) for end in face.span)
-        found = {'min': low, 'max': high, 'step': round(10.0 ** -face.decimals, 9),
-                 'disabled': bool(obstacle) or not self._field.enabled}
-        if any(self._slider.props.get(name) != value for name, value in found.items()):
-            self._slider.props.update(found)
-        for control in (self._field, self._button):
-            self._page.allow(control, not obstacle, obstacle)
-        text = face.exact(present) if math.isfinite(present) else ''
-        if text and self._field.value == self._shown:
-            self._field.set_value(text)
-        self._shown = text
-        attribute(self._box, 'data-present', text)
-
-    def _reset(self) -> None:
-        self._field.set_value(self._shown)
-        self._answer.set_text('')
+        _update(self._slider, min=low, max=high, step=round(10.0 ** -face.decimals, 9))
+        _update(self._box, disabled=bool(obstacle) or not self._field.enabled, title=obstacle)
+        attribute(self._box, 'data-present', face.exact(present) if math.isfinite(present) else '')
+        attribute(self._box, 'data-answered', self._answered)
 
     async def _submit(self) -> None:
+        typed, self._answered = str(self._field.value), ''
         try:
-            value = parsed_number(str(self._field.value))
+            value = parsed_number(typed)
         except ValueError as error:
             self._answer.show(Answer(False, str(error)))
             return
         self._answer.set_text('sent …')
         self._answer.show(await self._send(value))
-        # whatever the answer is, the field shows the present value again
-        self._shown = str(self._field.value)
+        self._answered = typed
+
+
+def _update(element: Element, **props: object) -> None:
+    """Change attributes of an element, and send it to the page where one is new."""
+    if any(element.props.get(name) != value for name, value in props.items()):
+        element.props.update(props)
+        element.update()
 
 
 async def _experiment_goes_on(page: PageLayout, signal: str) -> bool:

@@ -79,15 +79,30 @@ addEventListener('DOMContentLoaded', () => {
   watched.wrap = wrap;
   if (window.socket) wrap(window.socket);
 
-  // An entry that differs from the present value is marked as typed and not sent. Its slider follows
-  // the text, and the text its slider; the arrow keys step both.
+  // An entry shows the present value until another one is typed, and again after an answer to that.
+  // What differs is marked as typed and not sent. Its slider follows the text, and the text its
+  // slider; the arrow keys step both.
   const number = text => Number(text.trim().replace(',', '.'));
-  const type = (field, value, step) => {
-    field.value = value.toFixed(Math.max(0, -Math.floor(Math.log10(step) + 1e-9)));
+  const write = (field, text) => {
+    field.value = text;
     field.dispatchEvent(new Event('input', { bubbles: true }));
+  };
+  const type = (field, value, step) => {
+    write(field, value.toFixed(Math.max(0, -Math.floor(Math.log10(step) + 1e-9))));
   };
   const parts = ask => [ask.querySelector('input:not([type=range])'),
                         ask.querySelector('input[type=range]')];
+  const shown = new WeakMap();  // what an entry was told last
+  const follow = () => {
+    for (const one of document.querySelectorAll('.ask[data-present]')) {
+      const [field] = parts(one), { present, answered } = one.dataset, before = shown.get(one);
+      if (!field || (before?.present === present && before?.answered === answered)) continue;
+      shown.set(one, { present, answered });
+      if (field.value === (before?.present ?? '') || (answered && field.value === answered)) {
+        write(field, present);
+      }
+    }
+  };
   const mark = () => {
     for (const one of document.querySelectorAll('.ask[data-present]')) {
       const [field, slider] = parts(one), typed = field?.value ?? '';
@@ -106,6 +121,7 @@ addEventListener('DOMContentLoaded', () => {
     const ask = event.target.closest?.('.ask[data-present]');
     if (!ask || !event.target.matches('input')) return;
     const [field, slider] = parts(ask), value = number(field.value);
+    if (event.key === 'Escape') write(field, ask.dataset.present);
     if (event.target === slider && ['Enter', 'Escape'].includes(event.key)) {
       field.dispatchEvent(new KeyboardEvent('keydown', { key: event.key, bubbles: true }));
       if (event.key === 'Escape') slider.blur();
@@ -156,6 +172,7 @@ addEventListener('DOMContentLoaded', () => {
     if (head && document.title !== head.dataset.title) document.title = head.dataset.title;
     const sound = document.getElementById('sound');
     sound?.setAttribute('aria-pressed', String(sounds()));
+    follow();
     mark();
     if (beat && beat.dataset.beat !== seen) {
       seen = beat.dataset.beat; last = now();

@@ -83,25 +83,30 @@ def ready(page: Page) -> None:
 
 
 class Wire:
-    """The connection of a page, which a test interrupts: messages wait, as in a network."""
+    """
+    The connection of a page, which a test interrupts: messages wait, as in a network.
+
+    :ivar cut: whether messages wait.
+    :ivar held: whether those of the page wait, and those to it pass.
+    """
 
     def __init__(self) -> None:
-        self.cut = False
+        self.cut = self.held = False
         self._waiting: list[Any] = []
 
     def __call__(self, route: WebSocketRoute) -> None:
         server = route.connect_to_server()
-        route.on_message(lambda text: self._pass(server.send, text))
-        server.on_message(lambda text: self._pass(route.send, text))
+        route.on_message(lambda text: self._pass(server.send, text, self.cut or self.held))
+        server.on_message(lambda text: self._pass(route.send, text, self.cut))
 
-    def _pass(self, send: Any, text: Any) -> None:
-        if self.cut:
+    def _pass(self, send: Any, text: Any, wait: bool) -> None:
+        if wait:
             self._waiting.append((send, text))
         else:
             send(text)
 
     def mend(self) -> None:
-        self.cut = False
+        self.cut = self.held = False
         while self._waiting:
             send, text = self._waiting.pop(0)
             send(text)
@@ -425,6 +430,38 @@ def test_alarms_are_filtered_sorted_selected_and_grouped_under_their_cause(desk:
         page.get_by_role('option', name='oldest first').click()
         expect(rows.first).to_contain_text('first-out')
         expect(rows.first).to_contain_text('9 s old')
+
+
+def test_what_a_person_types_stays_while_the_panel_sends_a_new_set_point(desk: Desk) -> None:
+    wire = Wire()
+    with desk.page(routed=wire) as (loop, page):
+        ready(page)
+        field, own = asked(page), face(page, 'temperature')
+        # the panel sees a key after it has sent what it knew before
+        wire.held = True
+        field.fill('')
+        for celsius, key in zip((43.0, 44.0, 46.0, 47.0), '46,4', strict=True):
+            loop.request(Action('otto', 'setpoint', 'temperature', celsius))
+            expect(own.locator('.value')).to_have_text(f'{celsius} °C')
+            field.press_sequentially(key)
+        expect(own.locator('.ask')).to_have_class(re.compile('typed'))
+        wire.mend()
+        field.press('Enter')
+        expect(own.locator('.answer')).to_have_text('accepted')
+        assert loop.asked[-1].value == 46.4
+        # what is typed before the answer is shown stays, too
+        for celsius in ('38', '39'):
+            field.fill(celsius)
+            field.press('Enter')
+        expect(own.locator('.value')).to_have_text('39.0 °C')
+        expect(field).to_have_value('39.0')
+        # a node that is silent disables the entry, and what is typed is still there after it
+        field.fill('41')
+        loop.silent.add(CONTROLLER)
+        expect(field).to_be_disabled()
+        loop.silent.remove(CONTROLLER)
+        expect(field).to_be_enabled()
+        expect(field).to_have_value('41')
 
 
 def test_an_entry_is_operated_by_keys_and_refuses_an_ambiguous_number(desk: Desk) -> None:
