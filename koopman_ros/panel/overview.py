@@ -88,9 +88,9 @@ class _Entry:
     """
     Entry of a number: typed, stepped by the arrow keys, or moved by a slider.
 
-    The page itself sets what the field shows (watch.js), which it is told by two attributes of the
-    box: the present value, and the text that was answered last. What the panel sent to the field
-    could arrive while a person types.
+    The page itself fills in the field (watch.js), from two attributes of the box: the present
+    value, and the text that was answered last. A text sent by the panel could arrive while a
+    person types.
 
     :param present: the requested value at present.
     """

@@ -92,7 +92,7 @@ addEventListener('DOMContentLoaded', () => {
   };
   const parts = ask => [ask.querySelector('input:not([type=range])'),
                         ask.querySelector('input[type=range]')];
-  const shown = new WeakMap();  // what an entry was told last
+  const shown = new WeakMap();  // the attributes of each entry, when last seen
   const follow = () => {
     for (const one of document.querySelectorAll('.ask[data-present]')) {
       const [field] = parts(one), { present, answered } = one.dataset, before = shown.get(one);

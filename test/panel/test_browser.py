@@ -446,7 +446,7 @@ def test_parameters_are_set_checked_and_rejected(site: Site) -> None:
 
 
 # Controls that are not disabled.
-USABLE = """controls => controls.filter(own => own.checkVisibility() && !own.disabled
+USABLE = """controls => controls.filter(own => own.checkVisibility() && !own.matches(':disabled')
     && own.innerText !== 'Export YAML' && !own.closest('.view')).map(own => own.outerHTML)"""
 
 
