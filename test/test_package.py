@@ -161,10 +161,11 @@ def test_rosdep_has_every_key_of_the_manifest_and_the_page_names_the_rest() -> N
 
 @pytest.mark.filterwarnings('ignore::DeprecationWarning')
 @pytest.mark.parametrize(('control_only', 'modules'), [
-    (False, 'plant controller trainer player replay'), (True, 'plant controller trainer')])
+    (False, 'plant controller trainer player replay'), (False, 'panel'),
+    (True, 'plant controller trainer')])
 def test_nodes_import_with_the_packages_of_the_page_alone(control_only: bool, modules: str
                                                           ) -> None:
-    """Where control_only, without what the page leaves out then."""
+    """Where control_only, without what the page leaves out then; the panel with what it adds."""
     keys = _keys()
     manifest = parse_package(ROOT / 'package.xml')
     manifest.evaluate_conditions({'KOOPMAN_ROS_CONTROL_ONLY': '1'} if control_only else {})
@@ -178,9 +179,12 @@ def test_nodes_import_with_the_packages_of_the_page_alone(control_only: bool, mo
               for name in line.split() if not name.startswith('-')}
     if control_only:
         named -= {'cloudpickle'}
+    if modules == 'panel':
+        (more,) = re.findall(r"`pip install ([^`]*)` for the \[panel\]", page)
+        named |= {re.split(r'[>=]', word.strip("'"))[0] for word in more.split()}
     there = installed_with(*(name for module in named for name in providers().get(module, ())))
     nodes = [f'koopman_ros.nodes.{name}' for name in modules.split()]
-    learning = [] if control_only else ['koopman_ros.learning', 'koopman_ros.execution.pools']
+    learning = ['koopman_ros.learning', 'koopman_ros.execution.pools'] * (not control_only)
     assert set(nodes) <= loaded(
         ', '.join([*nodes, *learning]), modules_without({*there, 'koopman-ros'}))
 
