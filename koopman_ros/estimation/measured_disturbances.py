@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+import math
 
 import numpy as np
 
-from koopman_ros.core.arrays import Array, read_only
+from koopman_ros.core.arrays import Array, change_within, read_only
 from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation.sensor_checks import out_of_range
@@ -44,7 +45,7 @@ def check_disturbances(limits: DisturbanceLimits, signals: Coordinates,
                        last: MeasuredDisturbances, values: Array, ages: Array,
                        time_ns: int) -> MeasuredDisturbances:
     """
-    Accept or reject the measurement of each disturbance.
+    Accept or reject the measurement of each disturbance, by its own stamp.
 
     :param last: of the sample before.
     :param values: (n_d,) measured last, in units; NaN for none.
@@ -65,10 +66,10 @@ def check_disturbances(limits: DisturbanceLimits, signals: Coordinates,
                                  limits.upper[i:i + 1], StatusCode.OUTSIDE_SENSOR)
         if fault is None:
             stamp_ns = time_ns - round(age * NANOSECONDS)
-            seconds = 0.0 if before_ns is None else max(
+            seconds = math.inf if before_ns is None else max(
                 0.0, (stamp_ns - before_ns) / NANOSECONDS)
-            if before_ns is not None and abs(value - found[i]) > limits.rate[i] * seconds and (
-                    seconds > 0.0):
+            # also of a stamp that does not advance, with which no sensor changes
+            if abs(value - found[i]) > change_within(limits.rate, seconds)[i]:
                 fault = reason(
                     StatusCode.JUMPED, signal=name, before=float(found[i]), value=value,
                     seconds=seconds, jump=0.0, rate=float(limits.rate[i]))

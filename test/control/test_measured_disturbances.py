@@ -173,7 +173,9 @@ def test_another_number_of_disturbances_is_rejected():
     # 1 K/s, 10 s after the last one
     (359.9, 0.0, None, 359.9), (361.0, 0.0, StatusCode.JUMPED, 350.0),
     (356.0, 5.0, StatusCode.JUMPED, 350.0), (350.0, 10.0, None, 350.0),
-    (352.0, 61.0, StatusCode.DISTURBANCE_SILENT, 350.0)])
+    # a stamp that does not advance leaves no time to change
+    (351.0, 10.0, StatusCode.JUMPED, 350.0), (395.0, 15.0, StatusCode.JUMPED, 350.0),
+    (350.0, 15.0, None, 350.0), (352.0, 61.0, StatusCode.DISTURBANCE_SILENT, 350.0)])
 def test_each_check_of_a_sensor_holds_its_own_value(value, age, code, held):
     signals = Coordinates(('feed', 'ambient'), ('K', 'K'), *np.array(
         [[350.0, 290.0], [5.0, 5.0], [340.0, 280.0], [360.0, 300.0]]))
@@ -186,6 +188,15 @@ def test_each_check_of_a_sensor_holds_its_own_value(value, age, code, held):
     assert [(one.code, one.values['signal']) for one in found.faults] == (
         [] if code is None else [(code, 'feed')])
     assert found.shifted(-SECOND).times_ns[1] == 109 * SECOND
+
+
+def test_without_a_rate_a_sensor_may_change_with_any_stamp():
+    loop = controller()
+    before = loop.step(State(), np.array([START]), 100 * SECOND, disturbances=np.array([350.0]))[0]
+    state = loop.step(before, np.array([START]), 110 * SECOND, disturbances=np.array([360.0]),
+                      ages=np.array([15.0]))[0]
+    assert state.disturbances.faults == ()
+    assert state.disturbances.value.tolist() == [360.0]
 
 
 def test_an_event_carries_disturbances_and_their_ages():
