@@ -136,6 +136,44 @@ def steady_state(rate: Callable[[Array], Array], slope: Callable[[Array], Array]
     return None
 
 
+def steady_states_near(rate: Callable[[Array], Array], slope: Callable[[Array], Array],
+                       start: Array, steps: int = 30, longest: float = 0.5,
+                       tolerance: float = 1e-9) -> Array:
+    """
+    Find steady states near many starts at once, without limits or a goal.
+
+    By Newton's method with the least change in each step. :func:`steady_state` finds the nearest
+    one, but takes 8 to 200 times as long for hundreds of starts.
+
+    :param rate: F, (M, n) -> (M, m).
+    :param slope: its derivative, (M, n) -> (M, m, n).
+    :param start: (M, n), of a magnitude of about 1.
+    :param steps: at most.
+    :param longest: change of a variable in a step.
+    :param tolerance: change below which a search has ended.
+    :return: (M', n), without those of starts near which none was found.
+    """
+    y = start
+    for _ in range(steps):
+        found, J = rate(y), slope(y)
+        good = np.isfinite(found).all(axis=1) & np.isfinite(J).all(axis=(1, 2))
+        y, found, J = y[good], found[good], J[good]
+        change = newton_steps(found, J)
+        left = np.linalg.norm(found + (J @ change[..., None])[..., 0], axis=1)
+        change *= longest / np.max(np.abs(change), axis=1, keepdims=True, initial=longest)
+        y, moved = y + change, np.max(np.abs(change), axis=1, initial=0.0)
+        if (moved < tolerance).all():
+            break
+    # a step also ends where the rate is not 0, but no variable changes it
+    rests = left <= tolerance * np.linalg.norm(J, axis=(1, 2))
+    return np.asarray(y[(moved < tolerance) & rests])
+
+
+def newton_steps(rate: Array, slope: Array) -> Array:
+    """Return the least steps (M, n) after which linearised rates (M, m) are nearest to 0."""
+    return np.asarray(-(np.linalg.pinv(slope) @ rate[..., None])[..., 0])
+
+
 def bounded_least_squares(ranks: Sequence[tuple[Array, Array]], lower: Array, upper: Array,
                           start: Array, settings: SteadyStateSettings = SteadyStateSettings()
                           ) -> Array:

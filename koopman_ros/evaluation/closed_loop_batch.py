@@ -23,8 +23,10 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.integration import integrate
 from koopman_ros.core.signals import Outputs
 from koopman_ros.core.solvers import differences, solve_riccati
+from koopman_ros.core.steady_state import newton_steps, steady_states_near
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import AppliedInputs, Estimate, MeasuredState, PendingInputs
+from koopman_ros.evaluation.closed_loop_settings import ClosedLoopSettings, SETTINGS
 from koopman_ros.execution import Notify
 from koopman_ros.model import LiftedModel, NetworkObservables
 from koopman_ros.model.lifted_model import NODES, WEIGHTS
@@ -34,18 +36,6 @@ from koopman_ros.tuning import InputLimits, Tuning
 Rate = Callable[[Array, Array], Array]
 # inputs (M, n_u) of states (M, n_x), as far as these are active; NaN where there is none
 _Feedback = Callable[[Array, NDArray[np.bool_]], Array]
-
-#: A law fails if its cost exceeds that with a perfect model by more than this factor.
-MOST_EXCESS = 1.05
-
-# A loop has arrived when it ends this close to the set-point, in units of the scale.
-_ARRIVED = 0.05
-# It is lost when a state is further than this from the nominal point, in units of its scale.
-_ESCAPED = 10.0
-# How many times as long a loop may go on when only some laws have arrived.
-_PATIENCE = 4
-# Share of the inputs' range, at either end, that a perfect model is not given.
-_KEPT = 0.1
 
 
 @dataclass(frozen=True)
@@ -59,6 +49,7 @@ class LoopBatch:
     samples: int
     steps: int  #: of integration, in an interval
     noise: Array  #: (n_x,) standard deviation of measured states, in scaled deviations
+    settings: ClosedLoopSettings = SETTINGS
 
     @property
     def seconds(self) -> float:
@@ -127,10 +118,11 @@ def judge_loops(given: LoopBatch, cases: tuple[Array, Array, Array], notify: Not
         costs[:, hopeless], no_gain[hopeless] = ended
     own, informed, *others = costs
     ratios, excess = _cost_ratios(own, np.min(others, axis=0)), _cost_ratios(own, informed)
-    if (beaten := ~(excess <= MOST_EXCESS) & ~hopeless).any():
+    # a perfect model must not win by the ends of a range, of which others cannot be as certain
+    if (beaten := ~(excess <= given.settings.most_excess) & ~hopeless).any():
         some = starts[beaten], targets[beaten], inputs[beaten]
-        again = _run(given, [_informed(given.within(_narrowed(limits)), *some[1:])], some, notify,
-                     operated=False)
+        less = given.within(_narrowed(limits, given.settings.kept))
+        again = _run(given, [_informed(less, *some[1:])], some, notify, operated=False)
         if again is None:
             return None
         excess[beaten] = np.minimum(excess[beaten], _cost_ratios(own[beaten], again[0][0]))
@@ -169,8 +161,25 @@ class DriftPlant:
 
     def holding(self, x: Array, v: Array) -> Array:
         """Return the inputs (M, n_u) nearest to `v` that hold the states (M, n_x) best."""
-        B = np.nan_to_num(self.slope(x, v)[..., x.shape[1]:])
-        return v - (np.linalg.pinv(B) @ self.rate(x, v)[..., None])[..., 0]
+        return v + newton_steps(
+            self.rate(x, v), np.nan_to_num(self.slope(x, v)[..., x.shape[1]:]))
+
+    def steady_states(self, x: Array, v: Array) -> tuple[Array, Array]:
+        """
+        Return steady states and inputs near given ones; those without one are left out.
+
+        Each begins at the inputs that hold the state best.
+        """
+        n = x.shape[1]
+
+        def parts(y: Array) -> tuple[Array, Array]:
+            return y[:, :n], y[:, n:]
+
+        with np.errstate(all='ignore'):
+            found = steady_states_near(
+                lambda y: self.rate(*parts(y)), lambda y: self.slope(*parts(y)),
+                np.hstack([x, self.holding(x, v)]))
+        return parts(found)
 
     @property
     def linearised(self) -> LiftedModel:
@@ -232,11 +241,11 @@ def _constant(law: Linear, setpoints: Array, inputs: Array, seconds: float) -> _
     return act
 
 
-def _narrowed(limits: InputLimits) -> InputLimits:
-    """Reduce the range for a perfect model: others cannot be as certain."""
+def _narrowed(limits: InputLimits, share: float) -> InputLimits:
+    """Reduce a range by a share at either end."""
     bounded = np.isfinite(limits.lower) & np.isfinite(limits.upper)
     margin = np.zeros(len(bounded))
-    margin[bounded] = _KEPT * (limits.upper - limits.lower)[bounded]
+    margin[bounded] = share * (limits.upper - limits.lower)[bounded]
     return replace(limits, lower=limits.lower + margin, upper=limits.upper - margin)
 
 
@@ -276,7 +285,8 @@ def _run(given: LoopBatch, feedbacks: Sequence[_Feedback], cases: tuple[Array, A
     :return: costs (F, M), infinite where a loop does not reach the set-point, and whether (M,) the
         first law had no gain on the way.
     """
-    plant, weights, samples = given.plant, given.weights, given.samples
+    plant, weights, samples, settings = (
+        given.plant, given.weights, given.samples, given.settings)
     starts, setpoints, inputs = cases
     n, (M, m) = starts.shape[1], inputs.shape
     y = np.tile(np.hstack([starts, np.zeros((M, 1))]), (len(feedbacks), 1, 1))
@@ -286,7 +296,7 @@ def _run(given: LoopBatch, feedbacks: Sequence[_Feedback], cases: tuple[Array, A
     commands: list[Array] = []  # of the first law
 
     def arrived() -> NDArray[np.bool_]:
-        return np.all(np.abs(y[..., :n] - setpoints) < _ARRIVED, axis=-1)
+        return np.all(np.abs(y[..., :n] - setpoints) < settings.arrived, axis=-1)
 
     def flow(y: Array, v: Array) -> Array:
         x = y[..., :n]
@@ -298,11 +308,11 @@ def _run(given: LoopBatch, feedbacks: Sequence[_Feedback], cases: tuple[Array, A
 
     # a loop that runs away ends as one that failed, whatever overflows meanwhile
     with np.errstate(all='ignore'):
-        for number in range(_PATIENCE * samples):
+        for number in range(settings.patience * samples):
             # the share of the usual time
             if watch(min(number, samples - 1) / samples):
                 return None
-            active = (np.abs(y[..., :n]) < _ESCAPED).all(axis=-1)
+            active = (np.abs(y[..., :n]) < settings.escaped).all(axis=-1)
             y[~active] = np.nan
             if number >= samples:
                 # where one law has arrived the others may, too; all of them get the same time

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from koopman_ros.core.plots import drawing, DRAWN_RANGE, legend
 from koopman_ros.core.units import shown, unit_label
-from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest, MOST_COST
+from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,8 +47,8 @@ def draw_loops(axes: Axes, check: ClosedLoopTest, i: int) -> None:
     low, high = shown(states.lower[i], unit), shown(states.upper[i], unit)
     axes.axvspan(low, high, **DRAWN_RANGE)
     kinds: tuple[tuple[NDArray[np.bool_], str, dict[str, Any]], ...] = (
-        (~check.poor & ~failed, f'reaches the set-point at up to {MOST_COST:g} times the cost of '
-                                'a linear law',
+        (~check.poor & ~failed, 'reaches the set-point at up to '
+         f'{check.settings.most_cost:g} times the cost of a linear law',
          {'color': '0.45', 'marker': '.'}),
         (check.poor & ~failed, 'does not; a perfect model would not either',
          {'facecolors': 'none', 'edgecolors': 'tab:blue', 'marker': 'o'}),

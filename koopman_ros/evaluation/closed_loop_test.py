@@ -20,46 +20,16 @@ from koopman_ros.evaluation.closed_loop_batch import (
     DriftPlant,
     judge_loops,
     LoopBatch,
-    MOST_EXCESS,
     Rate,
 )
+from koopman_ros.evaluation.closed_loop_settings import ClosedLoopSettings, SETTINGS
 from koopman_ros.execution import Backend, Serial
 from koopman_ros.model import Coordinates, LiftedModel, VerifiedLoops
 from koopman_ros.model.training_data import MAX_TRIED_LOOPS
 from koopman_ros.tuning import InputLimits, Tuning
 
 #: Closed loops that a law is judged by.
-LOOPS = 128
-#: A law is poor if its cost exceeds that of a linear one by more than this factor.
-MOST_COST = 1.1
-#: Share of the closed loops that may fail.
-MOST_FAILURES = 0.01
-#: Confidence of a statement about the starts that were not drawn.
-CONFIDENCE = 0.99
-
-# A loop starts at least so far from its set-point, in units of the scale.
-_APART = 0.25
-# Slowest time constants of the linear loop that a loop lasts, and the slowest rate relative to the
-# fastest that is waited for.
-_DURATION = 6.0
-_SLOWEST = 1e-3
-# Samples in the fastest time constant of the linear loop, and steps of integration.
-_SAMPLES, _STEPS = 2, 8
-# A slow plant takes many samples: fewer loops then, so that the law is called so often in all.
-_MOST_CALLS = 150 * LOOPS
-_FEWEST_LOOPS = 16
-# Loops that are run side by side, the same ones wherever that is: sums depend on how many.
-_PART = 32
-# Share of the steady states that are set-points although none is where the data are.
-_NEAREST = 0.1
-# Attempts for each set-point.
-_ATTEMPTS = 4
-_NEWTON_STEPS = 30
-_LONGEST_STEP = 0.5
-# Share of the box to which ranges are stated.
-_ROUNDED = 1e-3
-_LARGEST_GAIN = 1e6  # of a law, in scaled coordinates
-_RESOLUTION = 1e-9  # remainder of a step, in scaled deviations
+LOOPS = SETTINGS.loops
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,16 +50,17 @@ class ClosedLoopTest:
     #: loops in which no law arrives within the inputs' limits; they are judged without these, and
     #: do not count where none arrives then
     hopeless: int
+    settings: ClosedLoopSettings = SETTINGS
 
     @property
     def poor(self) -> NDArray[np.bool_]:
         """Whether each loop (N,) had no gain, no arrival, or over 1.1 times a linear cost."""
-        return np.asarray(~(self.ratios <= MOST_COST))
+        return np.asarray(~(self.ratios <= self.settings.most_cost))
 
     @property
     def failed(self) -> NDArray[np.bool_]:
         """Whether in each loop (N,) a perfect model would cost clearly less, by 1.05."""
-        return np.asarray(~(self.excess <= MOST_EXCESS))
+        return np.asarray(~(self.excess <= self.settings.most_excess))
 
     @property
     def lost(self) -> NDArray[np.bool_]:
@@ -124,7 +95,7 @@ class ClosedLoopTest:
     @property
     def accepted(self) -> bool:
         """Whether the model may control: at most 1 % of the loops failed by its fault."""
-        return self.share_failed <= MOST_FAILURES
+        return self.share_failed <= self.settings.most_failures
 
     @property
     def median_ratio(self) -> float:
@@ -145,7 +116,7 @@ class ClosedLoopTest:
             f'{self._ranges(self.setpoints[failed])}')
 
     def _ranges(self, x: Array) -> str:
-        step = _ROUNDED * (self.states.upper - self.states.lower)
+        step = self.settings.rounded * (self.states.upper - self.states.lower)
         # round 1e-17 and -0 to 0
         low, high = (step * np.round(end / step) + 0.0 for end in (x.min(axis=0), x.max(axis=0)))
         return ', '.join(
@@ -173,7 +144,7 @@ class ClosedLoopTest:
         counts = ((int(np.sum(failed & self.no_gain)), 'without a gain'),
                   (int(np.sum(failed & lost & ~self.no_gain)), 'without reaching the set-point'),
                   (int(np.sum(failed & ~lost)),
-                   f'at over {MOST_EXCESS:g} times the cost with a perfect model'))
+                   f'at over {self.settings.most_excess:g} times the cost with a perfect model'))
         return f'{text} ({", ".join(f"{n} {what}" for n, what in counts if n)}), {self.region}'
 
     def __repr__(self) -> str:
@@ -181,7 +152,8 @@ class ClosedLoopTest:
         return f'<ClosedLoopTest: {self}>'
 
 
-def statement(checks: Sequence[ClosedLoopTest], models: int = 1) -> str:
+def statement(checks: Sequence[ClosedLoopTest], models: int = 1,
+              confidence: float = SETTINGS.confidence) -> str:
     """
     Return a bound of the share of all starts that may fail, in words; '' without loops.
 
@@ -196,9 +168,9 @@ def statement(checks: Sequence[ClosedLoopTest], models: int = 1) -> str:
         [one.loops for one in checks], [one.failed.sum() for one in checks]))
     if not loops:
         return ''
-    most = betaincinv(failed + 1, loops - failed, CONFIDENCE) if failed < loops else 1.0
+    most = betaincinv(failed + 1, loops - failed, confidence) if failed < loops else 1.0
     where = f' on {models} models that explain the record equally well' if models > 1 else ''
-    return (f'{failed} of {loops} loops failed{where}: with {100.0 * CONFIDENCE:g} % confidence '
+    return (f'{failed} of {loops} loops failed{where}: with {100.0 * confidence:g} % confidence '
             f'at most {float(f"{100.0 * most:.2g}"):g} % of such starts fail')
 
 
@@ -219,10 +191,10 @@ class _Undisturbed:
 def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
                           law: type[Law] = StateDependentRiccati,
                           limits: InputLimits | None = None, interval: float = 0.0,
-                          noise: Array | None = None, loops: int = LOOPS, seed: int = 0,
+                          noise: Array | None = None, loops: int | None = None, seed: int = 0,
                           watch: Callable[[float], bool] = lambda _: False,
-                          backend: Backend | None = None, disturbances: Sequence[str] = ()
-                          ) -> ClosedLoopTest | None:
+                          backend: Backend | None = None, disturbances: Sequence[str] = (),
+                          settings: ClosedLoopSettings = SETTINGS) -> ClosedLoopTest | None:
     """
     Test a model's law in closed loops on a drift that the model was not learned from.
 
@@ -247,12 +219,14 @@ def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | No
     :param interval: seconds between samples; by default, and at least, half of the fastest
         time constant of the linear loop.
     :param noise: (n_x,) standard deviation of the measured states, in state units; by default 0.
-    :param loops: closed loops to run; fewer where these take many samples.
+    :param loops: closed loops to run, by default those of the settings; fewer where these take
+        many samples.
     :param seed: of the random starts and set-points.
     :param watch: called with the share that is done; True ends the check.
     :param backend: where the loops run, 32 of them side by side; this process by default.
     :param disturbances: inputs that are measured and not manipulated; they keep their nominal
         values.
+    :param settings: the other numbers of the test.
     :return: None where `watch` ended it.
     :raises ValueError: for a model without inputs.
     """
@@ -261,24 +235,28 @@ def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | No
         rate = _Undisturbed(rate, model, tuple(map(model.joined.inputs.names.index, names)))
     if model.n_u == 0:
         raise ValueError('a plant without inputs cannot be controlled')
-    tuning = tuning or Tuning.for_model(model, max_gain=_LARGEST_GAIN)
+    tuning = tuning or Tuning.for_model(model, max_gain=settings.largest_gain)
     limits = limits or tuning.limits
     plant = DriftPlant(model, rate)
     linear = plant.linearised
     slowest, fastest = _closed_loop_rates(linear, Weights.physical(
-        linear, tuning.state_weight, tuning.input_weight))
-    interval = max(interval / model.seconds_per_time_unit, 1.0 / (_SAMPLES * fastest))
+        linear, tuning.state_weight, tuning.input_weight), settings)
+    interval = max(interval / model.seconds_per_time_unit, 1.0 / (settings.samples * fastest))
     dead_time = float(np.max(model.dead_time)) / model.seconds_per_time_unit
     # rounding adds no sample and no step where the slowest mode is the fastest, too
-    samples = math.ceil((_DURATION / slowest + dead_time) / interval - _RESOLUTION)
-    loops = min(loops, max(_MOST_CALLS // samples, _FEWEST_LOOPS))
-    starts, targets, inputs = _cases(plant, limits, loops, seed)
+    samples = math.ceil(
+        (settings.duration / slowest + dead_time) / interval - settings.resolution)
+    loops = min(loops or settings.loops,
+                max(settings.most_calls // samples, settings.fewest_loops))
+    starts, targets, inputs = _cases(plant, limits, loops, seed, settings)
     given = LoopBatch(plant, replace(tuning, limits=limits), law, interval, samples,
-                      math.ceil(_STEPS * interval * fastest - _RESOLUTION),
-                      np.zeros(model.n_x) if noise is None else noise / model.states.scale)
-    parts = {f'loops from {first + 1} on': (
-        starts[first:first + _PART], targets[first:first + _PART], inputs[first:first + _PART])
-        for first in range(0, max(1, len(starts)), _PART)}
+                      math.ceil(settings.steps * interval * fastest - settings.resolution),
+                      np.zeros(model.n_x) if noise is None else noise / model.states.scale,
+                      settings)
+    parts = {}
+    for first in range(0, max(1, len(starts)), settings.part):
+        rows = slice(first, first + settings.part)
+        parts[f'loops from {first + 1} on'] = starts[rows], targets[rows], inputs[rows]
     shares = dict.fromkeys(parts, 0.0)
 
     def watching(name: str, share: float | None) -> bool:
@@ -300,44 +278,45 @@ def evaluate_closed_loops(model: LiftedModel, rate: Rate, *, tuning: Tuning | No
     counts = np.isfinite(own) | np.isinf(ratios) | np.isinf(excess)
     x0, x_ref = (model.states.to_physical(x[counts]) for x in (starts, targets))
     return ClosedLoopTest(model.states, x0, x_ref, ratios[counts], no_gain[counts], excess[counts],
-                          int(np.sum(hopeless)))
+                          int(np.sum(hopeless)), settings)
 
 
-def _closed_loop_rates(linear: LiftedModel, weights: Weights) -> tuple[float, float]:
+def _closed_loop_rates(linear: LiftedModel, weights: Weights, settings: ClosedLoopSettings
+                       ) -> tuple[float, float]:
     """Return the slowest and the fastest rate of a linear model under its own law."""
     # not of the open loop: an integrator never settles by itself
     riccati = solve_riccati(linear.A, linear.B, weights.Q, weights.R)
     rates = np.abs(np.linalg.eigvals(linear.A - linear.B @ riccati.K).real)
-    fastest = max(float(rates.max()), _RESOLUTION)
+    fastest = max(float(rates.max()), settings.resolution)
     # samples are as short as the fastest mode, so that the span of rates bounds the work
-    return max(float(rates.min()), _SLOWEST * fastest), fastest
+    return max(float(rates.min()), settings.slowest * fastest), fastest
 
 
-def _cases(plant: DriftPlant, limits: InputLimits, loops: int, seed: int
-           ) -> tuple[Array, Array, Array]:
+def _cases(plant: DriftPlant, limits: InputLimits, loops: int, seed: int,
+           settings: ClosedLoopSettings) -> tuple[Array, Array, Array]:
     """Return starts (M, n_x), set-points (M, n_x) and the inputs (M, n_u) that hold these."""
     model = plant.model
     n, m = model.n_x, model.n_u
     rng = np.random.default_rng(seed)
     starts = _within_data(model, loops, rng)
-    anchors = _within_data(model, _ATTEMPTS * loops, rng)
+    anchors = _within_data(model, settings.attempts * loops, rng)
     # the nominal point, too, lest there be none
-    x, v = _steady(plant, np.vstack([np.zeros(n), anchors]),
-                   np.vstack([np.zeros(m), _between(model.inputs, rng.random((
-                       len(anchors), m)))]))
+    x, v = plant.steady_states(
+        np.vstack([np.zeros(n), anchors]),
+        np.vstack([np.zeros(m), _between(model.inputs, rng.random((len(anchors), m)))]))
     u = model.inputs.to_physical(v)
-    slack = _RESOLUTION * model.inputs.scale
+    slack = settings.resolution * model.inputs.scale
     held = ((u >= limits.lower - slack) & (u <= limits.upper + slack)).all(axis=1)
     x, v = x[held], v[held]
     distance = model.distances(x)
-    near = distance <= _RESOLUTION
+    near = distance <= settings.resolution
     if len(x) and not near.any():
         # a plant that never rested in the record: at the steady states nearest to it
-        near = distance <= np.quantile(distance, _NEAREST)
+        near = distance <= np.quantile(distance, settings.nearest)
     x, v = x[near], v[near]
     chosen: list[tuple[int, int]] = []
     for k, start in enumerate(starts):
-        apart = np.flatnonzero(np.max(np.abs(x - start), axis=1, initial=0.0) >= _APART)
+        apart = np.flatnonzero(np.max(np.abs(x - start), axis=1, initial=0.0) >= settings.apart)
         if len(apart):
             chosen.append((k, int(rng.choice(apart))))
     first, second = np.array(chosen, dtype=np.int64).reshape(-1, 2).T
@@ -359,22 +338,3 @@ def _within_data(model: LiftedModel, count: int, rng: np.random.Generator) -> Ar
     around = (2.0 * shares - 1.0) * known.fill_distance * 0.5 * (upper - lower)
     places = known.states[rng.integers(len(known.states), size=count)]
     return np.clip(places + around, lower, upper)
-
-
-def _steady(plant: DriftPlant, x: Array, v: Array) -> tuple[Array, Array]:
-    """Move states and inputs as little as it takes to rest; those that do not are left out."""
-    n = x.shape[1]
-    with np.errstate(all='ignore'):
-        v = plant.holding(x, v)
-        for _ in range(_NEWTON_STEPS):
-            rate, slope = plant.rate(x, v), plant.slope(x, v)
-            good = np.isfinite(rate).all(axis=1) & np.isfinite(slope).all(axis=(1, 2))
-            x, v, rate, slope = x[good], v[good], rate[good], slope[good]
-            change = -(np.linalg.pinv(slope) @ rate[..., None])[..., 0]
-            length = np.max(np.abs(change), axis=1, keepdims=True, initial=_LONGEST_STEP)
-            change *= _LONGEST_STEP / length
-            x, v = x + change[:, :n], v + change[:, n:]
-            if np.max(np.abs(change), initial=0.0) < _RESOLUTION:
-                break
-        still = np.max(np.abs(change), axis=1, initial=0.0) < _RESOLUTION
-    return x[still], v[still]

@@ -3,27 +3,30 @@
 
 """States from which a limited input can bring an unstable plant back."""
 
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.integration import runge_kutta_step
+from koopman_ros.core.integration import integrate, STEPS
 from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.plants.system import checked_vector, ControlAffineSystem
 
-# Of half the box: so near the nominal state the linear law holds the plant.
-_HOME = 0.1
-# Of the slowest mode under the law, in which it must get there.
-_TIME_CONSTANTS = 10.0
-# Steps of a tenth of the fastest mode's time constant: the box is checked after each.
-_STEP = 0.1
+
+@dataclass(frozen=True)
+class RecoverySettings:
+    """Settings of the simulations that show from where a plant returns."""
+
+    home: float = 0.1  #: share of half the box in which the linear law holds the plant
+    duration: float = 10.0  #: in slowest time constants under the law, in which it must get there
+    interval: float = 0.1  #: between checks of the box, in fastest time constants
 
 
 def recoverable(system: ControlAffineSystem, x: Array, *, input_lower: ArrayLike,
-                input_upper: ArrayLike, state_lower: ArrayLike, state_upper: ArrayLike
-                ) -> NDArray[np.bool_]:
+                input_upper: ArrayLike, state_lower: ArrayLike, state_upper: ArrayLike,
+                settings: RecoverySettings = RecoverySettings()) -> NDArray[np.bool_]:
     """
     Return from which states a limited input can return the plant to its nominal one.
 
@@ -54,18 +57,20 @@ def recoverable(system: ControlAffineSystem, x: Array, *, input_lower: ArrayLike
                          'another nominal state, or add an input that acts on the unstable modes')
     closed = np.linalg.eigvals(A - B @ riccati.K)
     fastest = max(np.max(np.abs(closed)), np.max(np.abs(np.linalg.eigvals(A))))
-    step = _STEP / fastest
+    interval = settings.interval / fastest
+    steps = STEPS.count(interval, fastest)
+    assert steps is not None
     found = np.zeros(len(x), dtype=bool)
     number, state = np.arange(len(x)), np.asarray(x, dtype=np.float64)
     # a diverging run may overflow before it is left out
     with np.errstate(all='ignore'):
-        for _ in range(int(_TIME_CONSTANTS / (np.min(-closed.real) * step))):
+        for _ in range(int(settings.duration / (np.min(-closed.real) * interval))):
             inside = np.all((state >= lower) & (state <= upper), axis=1)
-            home = np.max(np.abs((state - x0) / half), axis=1) <= _HOME
+            home = np.max(np.abs((state - x0) / half), axis=1) <= settings.home
             found[number[inside & home]] = True
             number, state = (a[inside & ~home] for a in (number, state))
             if not len(number):
                 break
             u = np.clip(u0 - (state - x0) @ riccati.K.T, lowest, highest)
-            state = runge_kutta_step(partial(system.derivative, u=u), state, step)
+            state = integrate(partial(system.derivative, u=u), state, interval, steps)
     return found

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from koopman_ros.core.arrays import Array, frozen, short_repr
 from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.solvers import differences
+from koopman_ros.core.steady_state import bounded_least_squares
 from koopman_ros.core.steady_state import steady_state as find_steady_state
 from koopman_ros.core.units import check_time_unit, checked_signals, SECONDS_PER_TIME_UNIT
 
@@ -30,6 +31,11 @@ def checked_vector(name: str, value: ArrayLike, length: int, *, finite: bool = T
     array = np.asarray(value, dtype=np.float64)
     whole = np.broadcast_to(array, (length,)) if array.ndim == 0 else array
     return frozen(whole, name, (length,), finite=finite)
+
+
+def _magnitude(nominal: Array) -> Array:
+    """Return the sizes (n,) of nominal values, and 1 where these are zero."""
+    return np.where(nominal != 0.0, np.abs(nominal), 1.0)
 
 
 @dataclass(frozen=True)
@@ -156,8 +162,7 @@ class ControlAffineSystem:
     @property
     def state_scale(self) -> Array:
         """The magnitude (n_x,) of each state: the nominal one, and 1 where that is zero."""
-        magnitude = np.abs(self.nominal_state)
-        return np.where(magnitude > 0.0, magnitude, 1.0)
+        return _magnitude(self.nominal_state)
 
     def derivative(self, x: ArrayLike, u: ArrayLike) -> Array:
         """Evaluate dx/dt = f(x) + B(x) u: (..., n_x), (..., n_u) that broadcast -> (..., n_x)."""
@@ -221,18 +226,21 @@ class EquilibriumError(ValueError):
 
 def equilibrium_input(system: ControlAffineSystem, state: ArrayLike) -> Array:
     """
-    Find the constant input (n_u,) that holds a state (n_x,): B(x) u = -f(x) by least squares.
+    Find the constant input (n_u,) that holds a state (n_x,), of several the nearest to nominal.
 
     A state is held when no state variable changes by more than 1e-9 of itself a time unit.
 
     :raises ValueError: when `state` does not fit the system.
     :raises EquilibriumError: when no input holds that state.
     """
-    held = system.checked_state('state', state)
-    u = np.asarray(np.linalg.lstsq(
-        system.input_matrix(held), -system.drift(held), rcond=None)[0], np.float64)
-    rate = system.derivative(held, u)
+    held, size = system.checked_state('state', state), _magnitude(system.nominal_input)
+    B, endless = system.input_matrix(held) * size, np.full(system.n_u, np.inf)
+    nominal = system.nominal_input / size
     magnitude = np.where(held != 0.0, np.abs(held), system.state_scale)
+    u = size * bounded_least_squares(
+        ((B / magnitude[:, None], -system.drift(held) / magnitude),
+         (np.eye(system.n_u), nominal)), -endless, endless, nominal)
+    rate = system.derivative(held, u)
     worst = int(np.argmax(np.abs(rate) / magnitude))
     if not abs(rate[worst]) <= 1e-9 * magnitude[worst]:
         raise EquilibriumError(
@@ -258,8 +266,7 @@ def steady_state(system: ControlAffineSystem, wanted: Mapping[str, float]
     held = np.array([name in wanted for name in system.state_names])
     n, x = system.n_x, system.nominal_state.copy()
     x[held] = [wanted[name] for name in system.state_names if name in wanted]
-    unit = np.concatenate([system.state_scale, np.where(
-        system.nominal_input != 0.0, np.abs(system.nominal_input), 1.0)])
+    unit = np.concatenate([system.state_scale, _magnitude(system.nominal_input)])
     endless = np.full(system.n_u, np.inf)
     lower, upper = (
         np.concatenate([np.where(held, x, end), sign * endless]) / unit

@@ -21,7 +21,13 @@ from koopman_ros.evaluation.optimal_cost import cost_along, Task
 from koopman_ros.event_log.records import decoded, encoded
 from koopman_ros.model import Coordinates, linearised_model, Provenance
 from koopman_ros.parameters.controller import built, table_of
-from koopman_ros.plants import Actuator, equilibrium_input, Process
+from koopman_ros.plants import (
+    Actuator,
+    equilibrium_input,
+    one_state_reactor,
+    Process,
+    ReactorParameters,
+)
 from koopman_ros.tuning import Tuning
 from support.closed_loops import COOLANT, FOULED, REACTOR, SECOND, SETPOINT, shipped, START
 
@@ -71,6 +77,51 @@ def test_a_late_coolant_brings_no_overshoot(seconds, known, estimator):
 def test_a_late_coolant_leaves_no_offset_on_a_changed_plant():
     run = step(*late_reactor(10.0, 11.0, FOULED), 400)
     assert abs(run.states[-1, 0] - SETPOINT) < 0.02
+
+
+WARMER = one_state_reactor(replace(
+    ReactorParameters(), feed_temperature=ReactorParameters().feed_temperature + 5.0),
+    nominal_state=REACTOR.nominal_state)
+
+
+def load_error(law, plant, period, samples):
+    """Return the integral of the error in K s after a step of the feed, which is not measured."""
+    start, plant, total = float(plant.x[0]), replace(plant, system=WARMER), 0.0
+    for k in range(samples):
+        plant = plant.until(k * period * SECOND)
+        error = float(plant.x[0]) - start
+        total += abs(error) * period
+        plant = plant.commanded(law(k, plant.x), k * period * SECOND)
+    return total
+
+
+@pytest.mark.parametrize(('known', 'share'), [(60.0, 0.7), (120.0, 0.7), (120.0, 1.3)])
+def test_an_unmeasured_load_step_costs_no_more_than_with_a_tuned_pi_controller(known, share):
+    period, samples = 3, 300
+    loop, plant, _ = late_reactor(share * known, known)
+    x = np.array([320.0])
+    rest = equilibrium_input(REACTOR, x)
+    plant, state = replace(plant, x=x, u=rest, command=rest), loop.initialise(State(), rest)
+
+    def controlled(k, x):
+        nonlocal state
+        state, u, _ = loop.step(state, x, (k + 1) * period * SECOND)
+        return u
+
+    # by the rules of Skogestad
+    rate, effect = (float(-REACTOR.drift_jacobian(x)[0, 0]) / 60.0,
+                    float(REACTOR.input_matrix(x)[0, 0]) / 60.0)
+    late = known + 0.5 * period
+    gain, reset, integral = 0.5 / (effect * late), min(1.0 / rate, 8.0 * late), 0.0
+
+    def pi(k, x):
+        nonlocal integral
+        error = float(x[0]) - 320.0
+        integral += error * period / reset
+        return rest - gain * (error + integral)
+
+    ours, usual = (load_error(law, plant, period, samples) for law in (controlled, pi))
+    assert ours <= 1.05 * usual
 
 
 def test_a_dead_time_twice_as_long_as_known_leaves_the_loop_stable():
@@ -160,8 +211,8 @@ def test_a_mode_too_fast_to_predict_over_the_dead_time_is_a_failure_of_the_level
 
 
 @pytest.mark.parametrize(('known', 'given', 'bandwidth'), [
-    (0.0, {}, 0.1), (5.0, {}, 0.1), (40.0, {}, 0.045), (40.0, {'dead_time': 0.0}, 0.1),
-    (0.0, {'dead_time': 80.0}, 0.027), (40.0, {'dead_time': -1.0}, 0.045),
+    (0.0, {}, 0.1), (5.0, {}, 0.1), (40.0, {}, 0.048), (40.0, {'dead_time': 0.0}, 0.1),
+    (0.0, {'dead_time': 80.0}, 0.031), (40.0, {'dead_time': -1.0}, 0.048),
     (40.0, {'observer_bandwidth': 0.1}, 0.1)])
 def test_the_default_bandwidth_falls_with_the_dead_time(known, given, bandwidth):
     model = replace(REACTOR_MODEL, dead_time=np.array([known]))

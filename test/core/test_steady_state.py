@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq, lsq_linear, minimize
 
-from koopman_ros.core.steady_state import bounded_least_squares, Goal, steady_state
+from koopman_ros.core.steady_state import (
+    bounded_least_squares,
+    Goal,
+    steady_state,
+    steady_states_near,
+)
 
 
 def linear(A, B, w, goal, places, lower, upper, start=None):
@@ -137,3 +142,27 @@ def test_a_search_from_far_away_arrives():
                      lambda y: np.array([[-np.cosh(y[0]), 1.0]]) / held, np.array([25.0, held]),
                      np.array([-np.inf, held]), np.array([np.inf, held]))
     assert y[0] == pytest.approx(brentq(lambda x: np.sinh(x) - held, 20.0, 40.0), abs=1e-6)
+
+
+def test_many_at_once_are_the_nearest_ones_of_linear_plants():
+    rng = np.random.default_rng(5)
+    J, w = rng.normal(size=(2, 5)), rng.normal(size=2)
+    start, endless = rng.normal(size=(20, 5)), np.full(5, np.inf)
+    found = steady_states_near(lambda y: y @ J.T + w, lambda y: np.tile(J, (len(y), 1, 1)), start,
+                               longest=1e3)
+    np.testing.assert_allclose(found, [steady_state(
+        lambda y: J @ y + w, lambda y: J, one, -endless, endless, anchor=one) for one in start],
+        rtol=0, atol=1e-9)
+
+
+def test_of_many_those_that_find_no_rest_are_left_out():
+    # x^2 = u with u given: nothing rests for u < 0, and the rate is no number below -2
+    def rate(y):
+        return np.where(y[:, 1:] < -2.0, np.nan, y[:, :1] ** 2 - y[:, 1:])
+
+    def slope(y):
+        return np.stack([2.0 * y[:, :1], 0.0 * y[:, :1]], axis=2)
+
+    found = steady_states_near(rate, slope, np.array(
+        [[1.0, 4.0], [1.0, -1.0], [0.0, -1.0], [1.0, -3.0], [-2.0, 9.0]]))
+    np.testing.assert_allclose(found, [[2.0, 4.0], [-3.0, 9.0]], rtol=0, atol=1e-9)

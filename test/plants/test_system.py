@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.plants import (
+    ControlAffineSystem,
     equilibrium_input,
     EquilibriumError,
     one_state_reactor,
@@ -161,6 +162,15 @@ def test_steady_states_and_their_eigenvalues(system, u, guess, state, eigenvalue
 def test_input_that_holds_a_state(system, state, coolant, tolerance):
     np.testing.assert_allclose(
         equilibrium_input(system, state), [coolant], rtol=0, atol=tolerance)
+
+
+def test_of_several_inputs_that_hold_a_state_those_nearest_to_the_nominal_ones_are_found():
+    nominal = np.array([2.0, 50.0])
+    system = ControlAffineSystem(
+        'mixer', ('level',), ('m',), ('a', 'b'), ('1', '1'), 's', lambda x: -x,
+        np.array([[1.0, 0.04]]), np.array([4.0]), nominal)
+    # in shares of the nominal ones, both inputs act alike
+    np.testing.assert_allclose(equilibrium_input(system, [5.0]), 1.25 * nominal, rtol=1e-12)
 
 
 @pytest.mark.parametrize(('system', 'state', 'message'), [
