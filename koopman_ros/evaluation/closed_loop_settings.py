@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What closed loops are tried, how long each lasts, and when a law has failed."""
+"""The closed loops of a test: their number and duration, and when a law has failed."""
 
 from dataclasses import dataclass
 
