@@ -180,7 +180,7 @@ def test_nodes_import_with_the_packages_of_the_page_alone(control_only: bool, mo
     if control_only:
         named -= {'cloudpickle'}
     if modules == 'panel':
-        (more,) = re.findall(r"`pip install ([^`]*)` for the \[panel\]", page)
+        (more,) = re.findall(r'`pip install ([^`]*)` for the \[panel\]', page)
         named |= {re.split(r'[>=]', word.strip("'"))[0] for word in more.split()}
     there = installed_with(*(name for module in named for name in providers().get(module, ())))
     nodes = [f'koopman_ros.nodes.{name}' for name in modules.split()]
