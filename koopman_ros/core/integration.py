@@ -9,15 +9,19 @@ same at every sample, also where a model is wrong. The adaptive pair simulates p
 reference of tests of the fixed steps.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 import math
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
-from scipy.integrate import DOP853
 
 from koopman_ros.core.arrays import Array
+
+if TYPE_CHECKING:
+    from scipy.integrate import DOP853
 
 __all__ = ['STEPS', 'StepRule', 'adaptive', 'fastest_rate', 'integrate', 'runge_kutta_step',
            'sensitivity_rate']
@@ -125,6 +129,8 @@ def adaptive(rate: Callable[[float, Array], Array], x: Array, duration: float, *
     :return: the solver where it ended, with its time ``t`` and state ``y``, and whether that is
         the end of the interval.
     """
+    from scipy.integrate import DOP853  # slow to import
+
     options: dict[str, Any] = {} if duration == 0.0 else {'first_step': duration}
     solver = DOP853(rate, 0.0, x, duration, rtol=rtol, atol=atol, **options)
     for _ in range(most):

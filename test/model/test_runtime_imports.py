@@ -19,5 +19,5 @@ def test_the_model_loads_no_other_package_of_ours_but_core() -> None:
 
 def test_nodes_load_nothing_large_that_they_do_not_need() -> None:
     assert not loaded('koopman_ros.nodes.controller, koopman_ros.nodes.trainer') & {
-        'torch', 'matplotlib', 'pint', 'daqp', 'nicegui', 'koopman_ros.plants',
-        'koopman_ros.learning'}
+        'torch', 'matplotlib', 'pint', 'daqp', 'nicegui', 'scipy.integrate', 'scipy.optimize',
+        'koopman_ros.plants', 'koopman_ros.learning'}

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import brentq
 
 from koopman_ros.core.arrays import Array, frozen
 
@@ -39,6 +38,8 @@ class HorizonGrid:
         powers, total, factor = np.arange(count), horizon / first, 1.0
         # near 1 the sum does not determine the factor
         if count > 1 and total > count * (1.0 + 1e-9):
+            from scipy.optimize import brentq  # slow to import
+
             factor = brentq(lambda g: np.sum(g ** powers) - total, 1.0, total, xtol=1e-14)
         return cls(frozen(np.minimum(first * factor ** powers, longest), 'intervals', (count,)))
 

@@ -8,7 +8,6 @@ from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import brentq
 
 from koopman_ros.core.arrays import along_last, Array
 from koopman_ros.plants.constants import constant, Constants
@@ -248,6 +247,8 @@ def _cold_stable_state(constants: ReactorParameters, drift: ArrayFunction,
     rising = np.flatnonzero(np.diff(balance) > 0.0)
     end = rising[0] if rising.size else -1
     if balance[0] > 0.0 > balance[end]:
+        from scipy.optimize import brentq  # slow to import
+
         temperature = brentq(
             lambda trial: heat_balance(np.asarray(trial)), grid[0], grid[end],
             xtol=1e-300, rtol=1e-15)
