@@ -210,7 +210,8 @@ def test_table_of_a_late_coolant_is_that_of_its_summary_and_keeps_its_bounds() -
         late_reactor.RECORD_LATE, abs=late_reactor.RECORD_PERIOD / 2.0)
     for shares in summary['late'].values():
         for found in shares.values():
-            assert found['overshoot_kelvin'] < 0.3
+            # of 10 K
+            assert found['overshoot_kelvin'] < 0.7
             assert found['cost'] < 1.05 * summary['least_cost']
 
 
