@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The controller: the control step, requests of the operator, and bumpless exchanges."""
+"""The controller: its parts, the control step, requests of the operator, bumpless exchanges."""
 
 from __future__ import annotations
 
@@ -13,36 +13,161 @@ import numpy as np
 
 from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.bumpless import with_step
-from koopman_ros.control.fallback import FallbackLevel
+from koopman_ros.control.estimates import StateEstimation
+from koopman_ros.control.fallback import build_levels, FallbackLevel
 from koopman_ros.control.margin import delay_margin
 from koopman_ros.control.recovery import rest_under, RestState
-from koopman_ros.control.state import Mode, State
+from koopman_ros.control.state import Mode, State, StepReport
 from koopman_ros.control.step import ControlStep
-from koopman_ros.control.supervisor import Supervisor
+from koopman_ros.control.supervisor import FallbackOrder, Supervisor
 from koopman_ros.control.timing import usual_interval
-from koopman_ros.core.arrays import Array, read_only
+from koopman_ros.core.arrays import Array, expect, read_only, short_repr
 from koopman_ros.core.plugins import contained
-from koopman_ros.core.signals import numbers
+from koopman_ros.core.signals import numbers, Outputs
 from koopman_ros.core.status import Reason, reason, StatusCode, UNMEASURED
 from koopman_ros.core.units import NANOSECONDS, nanoseconds
-from koopman_ros.estimation import DisturbanceObserver, equivalent_bias, Estimate, History
+from koopman_ros.estimation import (
+    DisturbanceObserver,
+    equivalent_bias,
+    Estimate,
+    History,
+    PendingInputs,
+)
+from koopman_ros.model import Coordinates, LiftedModel
+from koopman_ros.tuning import Tuning
 
 
 @dataclass(frozen=True)
-class Controller(ControlStep):
+class Controller:
     """
     A lifted model with its tuning, in a loop; every method is pure and returns a new state.
+
+    It has levels (a law and an estimator each), an order in which the supervisor chooses among
+    them, the estimation by the estimators, and a step that uses these.
 
     Example::
 
         controller = Controller(model, Tuning.for_model(model))
         state, command, report = controller.step(State(), measured, time_ns)
+
+    :raises ValueError: when the tuning does not fit the model's signals, or the measured signals
+        do not suffice for the estimator.
     """
+
+    model: LiftedModel  #: the lift
+    tuning: Tuning  #: with one number for each signal
+    #: measured outputs; by default the states that were measured in the model's training record
+    outputs: Outputs | None = None
+
+    __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        expect(model=(self.model, LiftedModel), tuning=(self.tuning, Tuning))
+        object.__setattr__(self, 'tuning', self.tuning.for_signals(
+            self.model, self.measured.names))
+        # reject now if a part cannot be built, and keep the built parts
+        assert self.order
+
+    # Its parts.
+
+    @cached_property
+    def measured(self) -> Outputs:
+        """The measured outputs: y = C x."""
+        states, rows = self.model.states, self.model.measured
+        own = states.only([states.names[i] for i in rows])
+        return self.outputs or Outputs(own.names, own.units, np.eye(len(states))[rows])
+
+    @cached_property
+    def levels(self) -> dict[str, FallbackLevel]:
+        """The levels with a law, by name, best first."""
+        return build_levels(self.model, self.measured, self.tuning)
+
+    @cached_property
+    def order(self) -> FallbackOrder:
+        """The order of all levels."""
+        return FallbackOrder(
+            tuple(self.levels), tuple(level.law.margin for level in self.levels.values()),
+            self.tuning.hold_timeout, self.tuning.recovery_time, self.tuning.safe_latch)
+
+    @cached_property
+    def estimation(self) -> StateEstimation:
+        """The estimators of the levels, behind the checks of the measurements."""
+        return StateEstimation(self.model, self.measured, self.tuning, self.levels)
+
+    @cached_property
+    def calculation(self) -> ControlStep:
+        """The list of what a step calculates by these parts."""
+        return ControlStep(self.model, self.tuning, self.levels, self.order, self.estimation)
+
+    @property
+    def best(self) -> FallbackLevel:
+        """The first level."""
+        return self.calculation.best
+
+    @property
+    def controlled(self) -> Coordinates:
+        """The states with a set-point."""
+        return self.best.controlled_states
+
+    @property
+    def safe_input(self) -> Array:
+        """The safe input (n_u,), commanded when no law can act, in input units."""
+        return self.calculation.safe_input
+
+    @property
+    def nominal_input(self) -> Array:
+        """The nominal input (n_u,) within its limits, in input units."""
+        return self.calculation.nominal_input
 
     @cached_property
     def rest(self) -> RestState:
         """Where the safe input leads the plant, according to the model."""
         return rest_under(self.model, self.safe_input, self.order.return_margin)
+
+    # Answers to measurements.
+
+    def step(self, state: State, y: Array, time_ns: int, applied: Array | None = None,
+             countable: float | None = None, disturbances: Array | None = None,
+             ages: Array | None = None, quality: tuple[int, ...] | None = None
+             ) -> tuple[State, Array, StepReport]:
+        """
+        Answer one measurement.
+
+        A repeated stamp and one out of order, earlier by at most a second, return the last command
+        again; a still earlier stamp resets the time. After a gap in the measurements ramp and rate
+        limit count twice the interval before it, not the gap. Stamps that return to where they
+        were before they went back count from the newest of those.
+
+        :param y: (n_y,) measured, in the signals' units.
+        :param applied: (n_u,) measured input at that time, or None; see
+            :meth:`StateEstimation.applied`.
+        :param countable: largest number of seconds since the last stamp that ramp and rate limit
+            count, from another clock; None for any.
+        :param disturbances: (n_d,) measured disturbances, NaN for one that is not measured, or
+            None; see :func:`koopman_ros.estimation.check_disturbances`.
+        :param ages: (n_d,) their ages in s, or None where they are of that time.
+        :param quality: (n_y,) 0 good, 1 uncertain, more bad, which counts as missing; None for
+            good.
+        :return: the new state, the command (n_u,) in input units, always finite and within the
+            limits, and the report.
+        :raises TypeError: for a time that is not an integer.
+        :raises ValueError: for a measurement or an input of another size.
+        """
+        return self.calculation.step(
+            state, y, time_ns, applied, countable, disturbances, ages, quality)
+
+    def hold(self, state: State, time_ns: int, cause: StatusCode | None = StatusCode.NO_MEASUREMENT
+             ) -> tuple[State, Array | None, StepReport]:
+        """
+        Command without a measurement: hold, and later go to the safe input.
+
+        :param time_ns: up to which nothing came, in the time of the measurements' stamps; before
+            the first of them, in that of any clock.
+        :param cause: why the command is held; None to command from the estimate, which the model
+            predicts.
+        :return: as :meth:`step`; the command is None before the first.
+        """
+        return self.calculation.hold(state, time_ns, cause)
 
     # Requests of the operator.
 
@@ -84,10 +209,11 @@ class Controller(ControlStep):
         goal = setpoints.at_its_time(requested, effective_ns, state.time_ns)
         try:
             with np.errstate(all='ignore'):
-                rejection = self._feasibility(state).infeasibility(
+                rejection = self.calculation.feasibility(state).infeasibility(
                     goal, np.isfinite(whole))
                 if rejection is None:
-                    return state._replace(setpoint=self._with_room(state, requested)), None
+                    return state._replace(
+                        setpoint=self.calculation.with_room(state, requested)), None
         except BaseException as error:
             rejection = reason(StatusCode.SETPOINT_NOT_TRIED, error=contained(error))
         return state, rejection
@@ -225,7 +351,8 @@ class Controller(ControlStep):
                     state.setpoint.active, state.estimate.under(
                         self.estimation.feed_forward(state)), None, usual_interval(state),
                     state.target, state.own_command,
-                    self.estimation.pending(state, state.commanded_ns or 0))[1]
+                    PendingInputs(state.applied, state.commanded_ns or 0,
+                                  self.estimation.dead_ns))[1]
                 return state if now.u is None else state._replace(
                     law_input=now.u, law_memory=now.memory, transfer=with_step(
                         state.transfer, state.law_input - now.u))

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -25,10 +24,11 @@ from koopman_ros.estimation import (
     check,
     check_disturbances,
     Estimate,
+    Estimator,
     History,
     Instant,
     MeasuredDisturbances,
-    PendingInputs,
+    Pieces,
     Standstill,
     Verdict,
     with_applied,
@@ -48,11 +48,18 @@ class Observation(NamedTuple):
 
 
 UNCERTAIN = 1  #: quality of a measurement; better is 0, worse are bad
-# After so many time constants without an accepted measurement the state is not known.
-_LOST = 2.0
-_ANALYSIS_NOISE = 0.01  # of the trained range, where it is not given
-# So many intervals between measurements are a gap.
-_GAP = 1.5
+
+
+@dataclass(frozen=True)
+class EstimationSettings:
+    """When an estimate starts again, and what is assumed where nothing is given."""
+
+    #: time constants of the observer without an accepted measurement after which the state is
+    #: not known
+    lost: float = 2.0
+    gap: float = 1.5  #: usual intervals between measurements that are a gap
+    #: standard deviation of a late value, as a share of the trained range
+    analysis_noise: float = 0.01
 
 
 @dataclass(frozen=True)
@@ -68,10 +75,11 @@ class StateEstimation:
     outputs: Outputs  #: its measured outputs
     tuning: Tuning  #: for these signals
     levels: dict[str, FallbackLevel]  #: by name, best first
+    settings: EstimationSettings = EstimationSettings()
 
     def level(self, supervisor: Supervisor) -> FallbackLevel:
         """Return the level in terms of whose model the estimate is: without a law, the last."""
-        name = supervisor.settled
+        name = supervisor.resumes or supervisor.level
         if name is None:
             return next(iter(self.levels.values()))
         found = self.levels.get(name)
@@ -82,10 +90,6 @@ class StateEstimation:
         """The dead time (n_u,) of each input in ns."""
         return tuple(round(seconds * NANOSECONDS)
                      for seconds in self.tuning.dead_times(self.model).tolist())
-
-    def pending(self, state: State, time_ns: int) -> PendingInputs:
-        """Return the inputs of which some act after the time of the estimate."""
-        return PendingInputs(state.applied, time_ns, self.dead_ns)
 
     def assumed(self, state: State) -> float:
         """Return the time in s for which assumed inputs, e.g. from before a start, still act."""
@@ -130,7 +134,7 @@ class StateEstimation:
         the new value is already part of the estimated disturbance, and is subtracted there.
         """
         signals = self.model.disturbances
-        if not len(signals):
+        if not signals.names:
             return state
         before = state.disturbances or MeasuredDisturbances(signals.center, (None,) * len(signals))
         values = np.full(len(signals), np.nan) if values is None else values
@@ -149,18 +153,21 @@ class StateEstimation:
             estimate, level.model.drift(estimate.x)
             - self.model.disturbance_rate(signals.center + change)))
 
-    def observe(self, state: State, y: Array, time: StepTime, quality: tuple[int, ...] | None
-                ) -> tuple[State, Observation]:
+    def observe(self, state: State, estimator: Estimator, y: Array, time: StepTime,
+                quality: tuple[int, ...] | None) -> tuple[State, Observation]:
         """
         Check a measurement (n_y,) and take it into account.
 
+        :param estimator: of the level that acts.
         :param quality: (n_y,) as of :class:`~koopman_ros.control.Measurement`.
         :return: the state with measurement, time and estimate, and the outcome of the measurement.
         """
         before, last, history = state.estimate, state.accepted, state.history
-        predicted = self.predict(state, time)
+        predicted = self._predict(state, estimator, time)
         x = x_measured = self.position(predicted, y)
-        outside = self.model.distance(x)
+        outside, states = self.model.distance(x), self.model.states
+        deviation = states.to_deviation(x)
+        expected = None if predicted is None else self.outputs.of(states.to_physical(predicted.x))
         w = np.zeros(self.model.n_x) if before is None else before.w
 
         def travel(then: Standstill) -> Array:
@@ -170,28 +177,28 @@ class StateEstimation:
                 return np.zeros_like(y)
             assert last is not None
             # from where the model has come to, which it may settle at
-            states = self.model.states
             x = states.to_deviation(self.outputs.state(
                 last.value + then.travel, states.to_physical(before.x)))
-            moved = self.predict(state._replace(estimate=replace(before, x=x, w=then.w)), time)
+            moved = self._predict(
+                state._replace(estimate=replace(before, x=x, w=then.w)), estimator, time)
             assert moved is not None
             return self.outputs.of((moved.x - x) * states.scale)
 
-        bad = [name for name, level in zip(self.outputs.names, quality or (), strict=False)
-               if level > UNCERTAIN]
+        bad = [] if quality is None else [
+            name for name, level in zip(self.outputs.names, quality, strict=False)
+            if level > UNCERTAIN]
         verdict = Verdict(last, reason(StatusCode.BAD_QUALITY, signal=bad[0])) if bad else check(
             self.tuning.sensor, self.outputs, last, y, time.now_ns, w, travel,
             max(self.dead_ns, default=0))
-        expected = None if predicted is None else self.outputs.of(
-            self.model.states.to_physical(predicted.x))
         if verdict.fault is None:
-            # an estimate that strayed from the data is corrected; a plant that did is not known
+            # restart if the plant, not only the estimate, is outside the training data
             far = outside > 0.0 and self._beyond(outside) and (
                 self.outputs.determine_state
                 or self._beyond(self.model.distance(self.position(None, y))))
             fresh = (predicted is None or verdict.moved or not time.elapsed > 0.0 or far
                      or self._lost(state, time))
-            predicted = self._corrected(state, predicted, x, time, fresh, quality)
+            predicted = self._corrected(
+                state, estimator, predicted, deviation, time, fresh, quality)
             if not isinstance(predicted, Estimate):
                 raise TypeError(f'the estimator returned {type(predicted).__name__}, '
                                 'not Estimate')
@@ -211,9 +218,10 @@ class StateEstimation:
             accepted = replace(accepted, standstill=replace(accepted.standstill, w=predicted.w))
         now = state._replace(accepted=accepted, time_ns=time.now_ns, estimate=predicted,
                       history=history)
-        return self._remembering(
-            now, state, time, x_measured if verdict.fault is None else None, quality
-        ), Observation(verdict, expected, x, outside)
+        if self._longest_ns:
+            now = self._remembering(
+                now, state, time, x_measured if verdict.fault is None else None, quality)
+        return now, Observation(verdict, expected, x, outside)
 
     def _beyond(self, outside: float) -> bool:
         """Whether no law acts at a distance from the training data."""
@@ -246,16 +254,16 @@ class StateEstimation:
                 return self.model.states.to_physical(found)
         return x
 
-    def _corrected(self, state: State, predicted: Estimate | None, x: Array, time: StepTime,
-                   fresh: bool, quality: tuple[int, ...] | None) -> Estimate:
+    def _corrected(self, state: State, estimator: Estimator, predicted: Estimate | None, xi: Array,
+                   time: StepTime, fresh: bool, quality: tuple[int, ...] | None) -> Estimate:
         """
         Return the estimate with a measurement that is accepted.
 
+        :param xi: (n_x,) scaled deviation of the state that the measurement is taken for.
         :param fresh: whether it starts from the measurement, as the prediction is worth nothing.
         """
-        xi, estimator = self.model.states.to_deviation(x), self.level(state.supervisor).estimator
-        if (factor := self._factor(quality)) is not None:
-            estimator = estimator.with_noise(factor)
+        if quality is not None:
+            estimator = estimator.with_noise(self._factor(quality))
         if predicted is None:
             # the input that acts, it is assumed, held the plant where it is
             return self._started(
@@ -275,30 +283,30 @@ class StateEstimation:
         # measured disturbances are part of the holding input
         return estimator.transferred(started, estimator.model.drift(started.x) - forward)
 
-    def _factor(self, quality: tuple[int, ...] | None) -> Array | None:
-        """Return the factor (n_y,) of the noise, or None for 1."""
-        return None if quality is None else np.where(
-            np.equal(quality, UNCERTAIN), self.tuning.uncertain_noise_factor, 1.0)
+    def _factor(self, quality: tuple[int, ...]) -> Array:
+        """Return the factor (n_y,) of the noise."""
+        return np.where(np.equal(quality, UNCERTAIN), self.tuning.uncertain_noise_factor, 1.0)
 
     def _remembering(self, now: State, before: State, time: StepTime, x: Array | None = None,
                      quality: tuple[int, ...] | None = None) -> State:
         """Return a state with its estimate in its history, if there may be late values."""
-        if not self._longest_ns or now.estimate is None:
+        if now.estimate is None:
             return now
-        pieces = () if before.command is None or not time.elapsed > 0.0 else tuple(
+        pieces = () if before.command is None or not time.elapsed > 0.0 else (
             self._pieces(before, time))
         return now._replace(history=now.history.followed_by(
             Instant(time.now_ns, now.estimate, pieces, self.feed_forward(before),
                     None if x is None else self.model.states.to_deviation(x),
-                    self._factor(quality)), self._longest_ns))
+                    None if quality is None else self._factor(quality)), self._longest_ns))
 
     @cached_property
     def _longest_ns(self) -> int:
         return round(float(np.max(self.tuning.analysis_delay)) * NANOSECONDS)
 
-    def predicted(self, state: State, time: StepTime) -> State:
-        """Return the state at a time without a measurement."""
-        return self._remembering(state._replace(estimate=self.predict(state, time)), state, time)
+    def predicted(self, state: State, estimator: Estimator, time: StepTime) -> State:
+        """Return the state at a time without a measurement, by the estimator of a level."""
+        now = state._replace(estimate=self._predict(state, estimator, time))
+        return self._remembering(now, state, time) if self._longest_ns else now
 
     def corrected(self, state: State, index: int, value: float, stamp_ns: int) -> State | None:
         """Return the state corrected by a late value of a state; None if it is too late."""
@@ -307,7 +315,7 @@ class StateEstimation:
         x[index] = value
         history = state.history.corrected(stamp_ns, Analysis(
             index, float(states.to_deviation(x)[index]), noise / float(states.scale[index]) or (
-                _ANALYSIS_NOISE * 2.0 * float(states.half_widths[index]))),
+                self.settings.analysis_noise * 2.0 * float(states.half_widths[index]))),
             self.level(state.supervisor).estimator)
         return None if history is None else state._replace(
             history=history, estimate=history.instants[-1].estimate)
@@ -318,10 +326,10 @@ class StateEstimation:
             return False
         seconds = (time.now_ns - state.accepted.time_ns) / NANOSECONDS
         # where measurements are always that rare, they are all there is
-        return seconds * self.tuning.observer_bandwidth > _LOST and (
-            seconds > _GAP * time.interval)
+        return seconds * self.tuning.observer_bandwidth > self.settings.lost and (
+            seconds > self.settings.gap * time.interval)
 
-    def predict(self, state: State, time: StepTime) -> Estimate | None:
+    def _predict(self, state: State, estimator: Estimator, time: StepTime) -> Estimate | None:
         """
         Predict the estimate up to a time without a measurement.
 
@@ -330,20 +338,22 @@ class StateEstimation:
         """
         if state.estimate is None or state.command is None or not time.elapsed > 0.0:
             return state.estimate
-        estimator = self.level(state.supervisor).estimator
         try:
             predicted = estimator.predict_over(
-                state.estimate, self._pieces(state, time), self.feed_forward(state))
+                state.estimate, self._pieces(state, time),
+                None if state.disturbances is None else self.feed_forward(state))
         except np.linalg.LinAlgError:
-            predicted = None  # so far out that the model gives no rate
+            predicted = None  # the drift overflows this far outside the training data
         return predicted if predicted is not None and predicted.finite else replace(
             state.estimate, covariance=None)
 
-    def _pieces(self, state: State, time: StepTime) -> Iterator[tuple[float, Array]]:
-        """Yield the inputs that acted since the last measurement, with the time of each in s."""
+    def _pieces(self, state: State, time: StepTime) -> Pieces:
+        """Return the inputs that acted since the last measurement, with the time of each in s."""
+        found: Pieces = ()
         for seconds, u in state.applied.pieces(
                 time.now_ns - round(time.elapsed * NANOSECONDS), time.now_ns, self.dead_ns):
-            yield seconds, self.model.inputs.to_deviation(u)
+            found += (seconds, self.model.inputs.to_deviation(u)),
+        return found
 
     def transfer_estimate(self, estimate: Estimate, before: FallbackLevel,
                           now: FallbackLevel) -> Estimate:

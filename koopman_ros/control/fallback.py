@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The control levels: a law and an estimator each, which fall back to the next one."""
+"""The control levels with a law: each a law and an estimator on one model."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from koopman_ros.control.laws.base import (
     Target,
 )
 from koopman_ros.control.steady_state import steady_state_target
-from koopman_ros.core.arrays import all_finite, Array, differ
+from koopman_ros.core.arrays import Array, differ
 from koopman_ros.core.plugins import contained, plug_in
 from koopman_ros.core.signals import numbers, Outputs
 from koopman_ros.core.status import Reason, reason, StatusCode
@@ -36,13 +36,18 @@ from koopman_ros.estimation import Estimate, Estimator, ESTIMATORS, PendingInput
 from koopman_ros.model import Coordinates, LiftedModel
 from koopman_ros.tuning import InputLimits, Tuning
 
-# Between the shortest dead time and the longest one a law is evaluated so many times at most.
-_MOST_EVALUATIONS = 20
-# A prediction takes steps of at least this share of the fastest time constant, and an estimator at
-# most so many of them at once.
-_PREDICTION_STEP, _MOST_STEPS = 0.1, 10
-# It spans at most so many of the fastest time constants: a step of a larger one takes seconds.
-_LONGEST_PREDICTION = 1000.0
+
+@dataclass(frozen=True)
+class PredictionSettings:
+    """The prediction of a state over the dead times of the inputs."""
+
+    #: evaluations of a law between the shortest dead time and the longest one, at most
+    evaluations: int = 20
+    #: inputs that act for a shorter time, in time constants of the fastest mode, are averaged
+    step: float = 0.1
+    steps: int = 10  #: of these that an estimator takes at once, at most
+    #: longest prediction, in time constants of the fastest mode: a longer one takes seconds
+    longest: float = 1000.0
 
 
 class _NotPredictedError(Exception):
@@ -59,13 +64,14 @@ class FallbackLevel:
     controlled: tuple[str, ...]  #: (n_c,) names of the states with a set-point
     #: whether it moves commands that are states of the model by itself, instead of the plant
     integrates: bool = field(default=True, kw_only=True)
+    prediction: PredictionSettings = field(default=PredictionSettings(), kw_only=True)
 
-    @property
+    @cached_property
     def model(self) -> LiftedModel:
         """The model of law and estimator."""
         return self.law.model
 
-    @property
+    @cached_property
     def limits(self) -> InputLimits:
         """Range and rate of the inputs."""
         return self.law.tuning.limits
@@ -78,7 +84,7 @@ class FallbackLevel:
         except BaseException as error:
             return reason(StatusCode.LAW_RAISED, error=contained(error))
 
-    @property
+    @cached_property
     def controls_all(self) -> bool:
         """Whether every state has a set-point."""
         return len(self.controlled) == self.model.n_x
@@ -135,15 +141,16 @@ class FallbackLevel:
 
         Here alone exceptions and invalid results of a law become a failure with a reason.
 
-        :param ahead: returns the set-points within a horizon in s, with the time until each.
+        :param ahead: returns the set-points within a horizon in s, with the time until each; None
+            where none is scheduled.
         """
         target = None
         try:
             target = self.target(setpoint, estimate.w, start)
             if target is None:
                 return None, LawResult(None, reason(StatusCode.NO_STEADY_STATE))
-            horizon = self.law.horizon(interval) if interval > 0.0 else 0.0
-            if ahead is not None and horizon > 0.0:
+            if ahead is not None and interval > 0.0 and (
+                    horizon := self.law.horizon(interval)) > 0.0:
                 horizon += max(pending.dead_ns) / NANOSECONDS if pending else 0.0
                 target = replace(target, later=tuple(
                     (seconds, found)
@@ -186,7 +193,7 @@ class FallbackLevel:
         if first.u is None or shortest == longest or planned or self.law.model_free:
             return first
         u, held = first.u.copy(), first.u
-        count = min(_MOST_EVALUATIONS, math.ceil(
+        count = min(self.prediction.evaluations, math.ceil(
             (longest - shortest) / NANOSECONDS / interval) if interval > 0.0 else 1)
         edges = sorted({*np.linspace(shortest, longest, count + 1).round().astype(int).tolist(),
                         *pending.dead_ns})
@@ -207,16 +214,17 @@ class FallbackLevel:
     def _predicted(self, estimate: Estimate, pieces: list[tuple[float, Array]]) -> Estimate:
         """Predict an estimate under inputs (n_u,), each with the seconds for which it acts."""
         model, ahead, gathered, impulse = self.model, 0.0, 0.0, np.zeros(self.model.n_u)
-        rate = model.linearised.fastest_rate / model.seconds_per_time_unit
-        step = _PREDICTION_STEP / rate if rate > 0.0 else math.inf
-        if not sum(seconds for seconds, _ in pieces) * rate <= _LONGEST_PREDICTION:
-            raise _NotPredictedError(_LONGEST_PREDICTION / rate)
+        settings, rate = self.prediction, model.linearised.fastest_rate / (
+            model.seconds_per_time_unit)
+        step = settings.step / rate if rate > 0.0 else math.inf
+        if not sum(seconds for seconds, _ in pieces) * rate <= settings.longest:
+            raise _NotPredictedError(settings.longest / rate)
         for k, (seconds, u) in enumerate(pieces, 1):
-            # of short pieces the mean acts as they do one by one
+            # the mean of short pieces has the same effect as one after the other
             gathered, impulse = gathered + seconds, impulse + seconds * u
             if gathered < step and k < len(pieces):
                 continue
-            count = max(1, math.ceil(gathered / (_MOST_STEPS * step)))
+            count = max(1, math.ceil(gathered / (settings.steps * step)))
             v = model.inputs.to_deviation(impulse / gathered)
             for _ in range(count):
                 found = self.estimator.advance(estimate, v, gathered / count,
@@ -237,12 +245,13 @@ class FallbackLevel:
         if result.failure is not None:
             return replace(result, u=None)
         u = numbers('input of the law', result.u, self.model.inputs.names)
-        if not all_finite(u):
+        if not all(map(math.isfinite, u.tolist())):
             return LawResult(None, reason(StatusCode.COMMAND_NOT_FINITE), result.info)
         if self.integrates and self.model.commanded and not self.law.model_free:
             u = self._moved(u, estimate, seconds)
         within = self.limits.within(u)
-        clipped = result.clipped or differ(within, u, self.model.inputs.scale)
+        clipped = result.clipped or (
+            bool((within != u).any()) and differ(within, u, self.model.inputs.scale))
         return LawResult(within, None, result.info, result.memory, result.plan, clipped,
                          result.passing)
 

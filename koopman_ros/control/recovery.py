@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -15,13 +16,18 @@ from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.model import LiftedModel
 from koopman_ros.model.steady_state import resting_state
 
-# The input is ahead of the plant by this share of the way from the safe input to the nominal
-# one; a frozen sensor moves it no further.
-_LEAD = 0.25
-# A state has moved if its distance from the middle of the training box changes by this share.
-_MOVED = 0.03
-# A state is at rest if it has not moved for so many times the recovery time.
-_REST = 3.0
+
+@dataclass(frozen=True)
+class RecoverySettings:
+    """When a plant under the safe input rests, and how the input leads it back."""
+
+    #: share of the way from the safe input to the nominal one by which the input is ahead of the
+    #: plant; a frozen sensor moves it no further
+    lead: float = 0.25
+    #: change of the distance from the middle of the training box, as a share of it, that counts
+    #: as a motion
+    moved: float = 0.03
+    rest: float = 3.0  #: recovery times without a motion after which the plant rests
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +36,7 @@ class SafeStateRecovery:
     How far a plant under the safe input has come back, by its distance from the training data.
 
     Where the safe input itself keeps the plant outside, no law may act, and waiting does not
-    help. The input then moves towards the nominal one: by :data:`_LEAD`, and by the share of the
+    help. The input then moves towards the nominal one: by `lead`, and by the share of the
     distance that the plant has left behind already. No model is asked how the plant moves out
     there. One that does not follow, or a sensor that does not, stops the input where it is.
     """
@@ -39,6 +45,7 @@ class SafeStateRecovery:
     nearest: float  #: smallest distance since then
     since_ns: int  #: from when it has rested
     led: bool = False  #: whether the input has begun to move
+    settings: ClassVar[RecoverySettings] = RecoverySettings()
 
     def moved(self, outside: float, time_ns: int, recovery_time: float, dead_time: float
               ) -> SafeStateRecovery | None:
@@ -51,17 +58,19 @@ class SafeStateRecovery:
         """
         if not (outside > 0.0 or self.led):
             return None
-        change, still = outside - self.farthest, _MOVED * (1.0 + self.farthest)
+        change, still = (
+            outside - self.farthest, self.settings.moved * (1.0 + self.farthest))
         if change > still or (change < -still and not self.led):
             return SafeStateRecovery(outside, outside, time_ns)
         led = self.led or (time_ns - self.since_ns) / NANOSECONDS >= (
-            _REST * recovery_time + 2.0 * dead_time)
+            self.settings.rest * recovery_time + 2.0 * dead_time)
         return SafeStateRecovery(self.farthest, min(self.nearest, outside), self.since_ns, led)
 
     @property
     def share(self) -> float:
         """The share of the nominal input in the command, from 0 to 1."""
-        return min(1.0, _LEAD + 1.0 - self.nearest / self.farthest) if self.led else 0.0
+        return min(1.0, self.settings.lead + 1.0 - self.nearest / self.farthest) if (
+            self.led) else 0.0
 
 
 def moves_toward_nominal(model: LiftedModel, x: Array, safe: Array, nominal: Array) -> bool:

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,21 +38,22 @@ def steady_state_target(model: LiftedModel, setpoint: Array, w: Array | None = N
     :param start: (n_x + n_u,) state and input to begin from, the nominal point by default.
     :return: None where no steady state was found.
     """
-    n, n_u = model.n_x, model.n_u
-    w, found = np.zeros(n) if w is None else w, None
+    n, n_u, target = model.n_x, model.n_u, None
+    w = np.zeros(n) if w is None else w
     y = np.zeros(n + n_u) if start is None else start.copy()
     if controlled is None or len(controlled) == n:
         # linear in the input, which is all that is left to find
-        controlled = np.arange(n)
-        y = np.concatenate((setpoint, -model.input_inverse(setpoint).dot(
-            model.drift(setpoint) + w)))
-        target = Target.at(model, y, w)
-        if target.residual <= _TOLERANCE:
-            found = y
+        controlled, f = np.arange(n), model.drift(setpoint)
+        y[n:] = u = -model.input_inverse(setpoint).dot(f + w)
+        forcing = model.forcing(setpoint, u) + w
+        residual = math.hypot(*(f + forcing).tolist())
+        if residual <= _TOLERANCE:
+            target = Target(setpoint, u, forcing, residual)
+            if limits is None or n_u == 1:
+                return target
+    y[controlled] = setpoint
     endless, goal = np.full(n + n_u, np.inf), Goal(controlled, setpoint)
-    if found is None:
-        y[controlled] = setpoint
-        found = model_steady_state(model, w, y, -endless, endless, goal)
+    found = model_steady_state(model, w, y, -endless, endless, goal) if target is None else y
     if found is None:
         return None
     if limits is not None and n_u > 1 and ((found[n:] < limits[0] - _TOLERANCE)
@@ -61,5 +64,5 @@ def steady_state_target(model: LiftedModel, setpoint: Array, w: Array | None = N
         # further off it is on another branch
         if within is not None and (
                 np.abs(within - found)[:n] <= 2.0 * model.states.half_widths + _TOLERANCE).all():
-            found = within
-    return Target.at(model, found, w)
+            return Target.at(model, within, w)
+    return Target.at(model, found, w) if target is None else target

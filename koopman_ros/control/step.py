@@ -4,22 +4,22 @@
 """
 The control step: one pure function of state, measurement and time, replayable bit for bit.
 
-check the measurement -> estimate -> set-point -> level -> law -> transfer -> limits -> report
+check the measurement -> estimate -> set-point -> level and law -> transfer -> limits -> report
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
+import math
 from typing import Any
 
 import numpy as np
 
 from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.bumpless import BumplessTransfer, limit, with_step
-from koopman_ros.control.configuration import Configuration
-from koopman_ros.control.estimates import UNCERTAIN
+from koopman_ros.control.estimates import StateEstimation, UNCERTAIN
 from koopman_ros.control.fallback import FallbackLevel
 from koopman_ros.control.feasibility import Feasibility
 from koopman_ros.control.laws.base import LawResult, Target
@@ -37,7 +37,14 @@ from koopman_ros.control.state import (
     TargetReport,
     WITHOUT_LAW,
 )
-from koopman_ros.control.supervisor import HOLD, LevelRequest, MANUAL, SAFE, Supervisor
+from koopman_ros.control.supervisor import (
+    Condition,
+    FallbackOrder,
+    HOLD,
+    MANUAL,
+    SAFE,
+    Supervisor,
+)
 from koopman_ros.control.timing import (
     afresh,
     check_interval,
@@ -45,48 +52,56 @@ from koopman_ros.control.timing import (
     time_of_measurement,
     time_of_silence,
 )
-from koopman_ros.core.arrays import all_finite, Array, read_only
+from koopman_ros.core.arrays import Array, read_only
 from koopman_ros.core.plugins import contained
 from koopman_ros.core.signals import numbers
 from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.core.units import LATE_NANOSECONDS, NANOSECONDS, nanoseconds
-from koopman_ros.estimation import Estimate, History, Verdict
+from koopman_ros.estimation import Estimate, History, PendingInputs, Verdict
+from koopman_ros.model import LiftedModel
+from koopman_ros.tuning import Tuning
 
 
 @dataclass(frozen=True)
-class ControlStep(Configuration):
-    """The step of a configured loop; every method is pure and returns a new state."""
+class ControlStep:
+    """The list of calculations of a step; each is done by one of the parts of a controller."""
+
+    model: LiftedModel  #: the lift
+    tuning: Tuning  #: for its signals
+    levels: dict[str, FallbackLevel]  #: with a law, by name, best first
+    order: FallbackOrder  #: of all levels
+    estimation: StateEstimation  #: by the estimators of the levels
+
+    @cached_property
+    def best(self) -> FallbackLevel:
+        """The first level."""
+        return next(iter(self.levels.values()))
+
+    @cached_property
+    def safe_input(self) -> Array:
+        """The safe input (n_u,), commanded when no law can act, in input units."""
+        return read_only(self.tuning.limits.within(self.tuning.safe_value))
+
+    @cached_property
+    def nominal_input(self) -> Array:
+        """The nominal input (n_u,) within its limits, in input units."""
+        return read_only(self.tuning.limits.within(self.model.inputs.center))
+
+    @cached_property
+    def ranges(self) -> tuple[tuple[str, float, float], ...]:
+        """(name, lower, upper) of the states' trained ranges."""
+        states = self.model.states
+        return tuple(zip(states.names, states.lower.tolist(), states.upper.tolist(), strict=True))
 
     def step(self, state: State, y: Array, time_ns: int, applied: Array | None = None,
              countable: float | None = None, disturbances: Array | None = None,
              ages: Array | None = None, quality: tuple[int, ...] | None = None
              ) -> tuple[State, Array, StepReport]:
-        """
-        Answer one measurement.
-
-        A repeated stamp and one out of order, earlier by at most a second, return the last command
-        again; a still earlier stamp resets the time. After a gap in the measurements ramp and rate
-        limit count twice the interval before it, not the gap. Stamps that return to where they
-        were before they went back count from the newest of those.
-
-        :param y: (n_y,) measured, in the signals' units.
-        :param applied: (n_u,) measured input at that time, or None; see
-            :meth:`StateEstimation.applied`.
-        :param countable: largest number of seconds since the last stamp that ramp and rate limit
-            count, from another clock; None for any.
-        :param disturbances: (n_d,) measured disturbances, NaN for one that is not measured, or
-            None; see :func:`koopman_ros.estimation.check_disturbances`.
-        :param ages: (n_d,) their ages in s, or None where they are of that time.
-        :param quality: (n_y,) 0 good, 1 uncertain, more bad, which counts as missing; None for
-            good.
-        :return: the new state, the command (n_u,) in input units, always finite and within the
-            limits, and the report.
-        :raises TypeError: for a time that is not an integer.
-        :raises ValueError: for a measurement or an input of another size.
-        """
-        y = numbers('measurement', y, self.measured.names,
+        """Answer one measurement; see :meth:`Controller.step`."""
+        y = numbers('measurement', y, self.estimation.outputs.names,
                     'pass outputs= to the controller if other signals are measured')
-        time_ns = nanoseconds(time_ns)
+        if type(time_ns) is not int:
+            time_ns = nanoseconds(time_ns)
         if applied is not None:
             applied = numbers('applied input', applied, self.model.inputs.names)
         if disturbances is not None and (signals := self.model.disturbances.names):
@@ -96,26 +111,29 @@ class ControlStep(Configuration):
         if state.command is not None and -LATE_NANOSECONDS <= ahead <= 0:
             arrival = Arrival.LATE if ahead < 0 else Arrival.REPEATED
             return state, state.command, self._report(
-                state, state.supervisor.reason, MeasurementReport(
-                    arrival, self._outside(state.estimate, y)))
+                state, self.estimation.level(state.supervisor), state.supervisor.reason,
+                MeasurementReport(arrival, self._outside(state.estimate, y)))
         back = ahead < 0
         if back:
             state = afresh(state, ahead)
         time, missed = time_of_measurement(state, time_ns, countable)
-        check_interval(self.model, state.interval, time.interval)
+        if time.interval < state.interval:
+            check_interval(self.model, state.interval, time.interval)
 
         def calculate() -> tuple[State, Array, StepReport]:
+            acting = self.estimation.level(state.supervisor)
             known, follows = self.estimation.applied(state, applied)
             known = self.estimation.disturbed(known, disturbances, ages, time_ns)
-            now, seen = self.estimation.observe(known, y, time, quality)
+            now, seen = self.estimation.observe(known, acting.estimator, y, time, quality)
             accepted = seen.verdict.fault is None
             if accepted:
                 now = self._advanced(now, seen.x, time)
-            return self._command(now, seen.verdict, MeasurementReport(
+            return self._command(now, acting, seen.verdict, MeasurementReport(
                 Arrival.ACCEPTED if accepted else Arrival.REJECTED,
                 seen.outside if accepted else self._outside(state.estimate, y), seen.expected,
-                missed, back, follows, tuple(
-                    name for name, level in zip(self.measured.names, quality or (), strict=False)
+                missed, back, follows, () if quality is None else tuple(
+                    name for name, level in zip(
+                        self.estimation.outputs.names, quality, strict=False)
                     if level == UNCERTAIN)), time)
 
         return self._contained(
@@ -124,31 +142,26 @@ class ControlStep(Configuration):
 
     def hold(self, state: State, time_ns: int, cause: StatusCode | None = StatusCode.NO_MEASUREMENT
              ) -> tuple[State, Array | None, StepReport]:
-        """
-        Command without a measurement: hold, and later go to the safe input.
-
-        :param time_ns: up to which nothing came, in the time of the measurements' stamps; before
-            the first of them, in that of any clock.
-        :param cause: why the command is held; None to command from the estimate, which the model
-            predicts.
-        :return: as :meth:`step`; the command is None before the first.
-        """
+        """Command without a measurement; see :meth:`Controller.hold`."""
         held, time_ns = state.command, nanoseconds(time_ns)
         if held is None:
-            return state, None, self._report(state, None)
+            return state, None, self._report(
+                state, self.estimation.level(state.supervisor), None)
         time = time_of_silence(state, time_ns)
 
         def calculate() -> tuple[State, Array, StepReport]:
-            now = self.estimation.predicted(state, time)
+            acting = self.estimation.level(state.supervisor)
+            now = self.estimation.predicted(state, acting.estimator, time)
             if cause is not None or state.mode is Mode.MANUAL:
                 fault = None if cause is None else reason(cause)
-                return self._command(now, Verdict(now.accepted, fault), NOTHING_MEASURED, time)
+                return self._command(
+                    now, acting, Verdict(now.accepted, fault), NOTHING_MEASURED, time)
             if now.estimate is None or now.setpoint.active is None:
                 now = now._replace(commanded_ns=time.command_ns)
-                return now, held, self._report(now, now.supervisor.reason)
+                return now, held, self._report(now, acting, now.supervisor.reason)
             x = self.model.states.to_physical(now.estimate.x)
             return self._command(
-                self._advanced(now, x, time), Verdict(now.accepted),
+                self._advanced(now, x, time), acting, Verdict(now.accepted),
                 MeasurementReport(outside=self.model.distance(x)), time)
 
         return self._contained(calculate, state, NOTHING_MEASURED, time, state.time_ns)
@@ -170,7 +183,7 @@ class ControlStep(Configuration):
             # a measurement of 1e300 may overflow on its way; the result is checked and limited
             with np.errstate(all='ignore'):
                 state, command, report = calculate()
-            if not all_finite(command):
+            if not all(map(math.isfinite, command.tolist())):
                 raise FloatingPointError(f'the command would be {command.tolist()}')
             if state.estimate is not None:
                 state.estimate.check(self.model.n_x)
@@ -178,12 +191,13 @@ class ControlStep(Configuration):
         except BaseException as error:
             fault = reason(StatusCode.CALCULATION_FAILED, error=contained(error))
             return self._command(
-                before.restarted(time_ns), Verdict(before.accepted, fault), measured, time)
+                before.restarted(time_ns), self.estimation.level(before.supervisor),
+                Verdict(before.accepted, fault), measured, time)
 
     def _advanced(self, state: State, x: Array, time: StepTime) -> State:
         """Return the state with the set-point of now; it begins from `x` (n_x,)."""
         setpoint = setpoints.advance(
-            state.setpoint, self.best.controlled_of(x), self.controlled,
+            state.setpoint, x[self.best.indices], self.best.controlled_states,
             self.tuning.setpoint_ramp, time.now_ns, time.counted,
             self.tuning.setpoint_filter_time)
         if setpoint is state.setpoint:
@@ -191,18 +205,19 @@ class ControlStep(Configuration):
         if setpoint.asked != state.setpoint.asked or state.setpoint.active is None:
             # a request from before the first measurement, or whose time has come
             setpoint = setpoints.advance(
-                self._with_room(state, setpoint), self.best.controlled_of(x), self.controlled,
-                self.tuning.setpoint_ramp, time.now_ns, 0.0, self.tuning.setpoint_filter_time)
+                self.with_room(state, setpoint), x[self.best.indices],
+                self.best.controlled_states, self.tuning.setpoint_ramp, time.now_ns, 0.0,
+                self.tuning.setpoint_filter_time)
         return state._replace(setpoint=setpoint)
 
-    def _with_room(self, state: State, setpoint: setpoints.Setpoint) -> setpoints.Setpoint:
+    def with_room(self, state: State, setpoint: setpoints.Setpoint) -> setpoints.Setpoint:
         """Move signals without a request to where the requested ones can be held."""
         goal, asked = setpoint.requested, np.array(setpoint.asked)
         if goal is None or asked.all() or not (asked.any() and np.isfinite(goal).all()):
             return setpoint
-        return replace(setpoint, requested=self._feasibility(state).yielding(goal, asked))
+        return replace(setpoint, requested=self.feasibility(state).yielding(goal, asked))
 
-    def _feasibility(self, state: State) -> Feasibility:
+    def feasibility(self, state: State) -> Feasibility:
         """Return the feasibility of set-points as things are."""
         acting, w = self.estimation.level(state.supervisor), np.zeros(self.model.n_x)
         # where a law acts that needs no model, none is trusted
@@ -211,87 +226,96 @@ class ControlStep(Configuration):
                 self.estimation.feed_forward(state)).w
         return Feasibility(self.best, self.order.margins[0], w, state.target)
 
-    def _command(self, state: State, verdict: Verdict, measured: MeasurementReport,
-                 time: StepTime) -> tuple[State, Array, StepReport]:
-        """Choose a level, and bring its input within the limits."""
-        transfer = state.transfer and state.transfer.after(
+    def _command(self, state: State, acting: FallbackLevel, verdict: Verdict,
+                 measured: MeasurementReport, time: StepTime
+                 ) -> tuple[State, Array, StepReport]:
+        """
+        Choose a level, and bring its input within the limits.
+
+        :param acting: in terms of whose model the estimate is.
+        """
+        now = acting
+        held = self.model.inputs.center if state.command is None else state.command
+        transfer = None if state.transfer is None else state.transfer.after(
             time.elapsed, self.tuning.bumpless_transfer_time)
         target, changes = None, dict(WITHOUT_LAW)
         if state.mode is Mode.MANUAL:
-            wanted = state.manual_input if state.manual_input is not None else (
-                self._last_command(state))
+            wanted = held if state.manual_input is None else state.manual_input
             done, why = NO_COMMAND, verdict.fault
         else:
-            supervisor, target, result = self._choose(state, verdict, measured.outside, time)
-            recovery = self._recovery(state, supervisor, verdict, measured.outside, time.now_ns)
-            changes, wanted, done = self._act(state, supervisor, recovery, result, transfer)
+            supervisor, target, result = self._choose(
+                state, acting, verdict, measured.outside, time)
+            recovery = None if supervisor.level != SAFE else self._recovery(
+                state, supervisor, verdict, measured.outside, time.now_ns)
+            changes, wanted, done = self._act(
+                state, held, supervisor, recovery, result, transfer)
             why = supervisor.reason
             changes |= {'supervisor': supervisor, 'recovery': recovery}
-            if state.estimate is not None:
-                levels = [self.estimation.level(one) for one in (state.supervisor, supervisor)]
-                changes['estimate'] = self.estimation.transfer_estimate(state.estimate, *levels)
-                if levels[0] is not levels[1]:
-                    changes['history'] = History()
+            if (supervisor.resumes or supervisor.level) != acting.name:
+                now = self.estimation.level(supervisor)
+            if now is not acting and state.estimate is not None:
+                changes |= {'history': History(), 'estimate': self.estimation.transfer_estimate(
+                    state.estimate, acting, now)}
             if target is not None and not self.best.controls_all:
                 changes['target'] = read_only(np.concatenate((
                     self.model.states.to_physical(target.x),
                     self.model.inputs.to_physical(target.u))))
         u, at_range, at_rate = limit(
             self.tuning.limits, self.model.inputs.scale, wanted, state.command, time.counted)
-        done = done._replace(at_range=done.at_range or at_range, at_rate=at_rate,
-                             outside=self.model.inputs.violation(u))
         applied = state.applied.followed_by(time.command_ns, u, self.estimation.dead_ns)
         # a command that is held leaves its time to the next one
-        held = measured.arrival is Arrival.MISSING and state.mode is Mode.AUTOMATIC and (
+        kept = measured.arrival is Arrival.MISSING and state.mode is Mode.AUTOMATIC and (
             changes['supervisor'].level == HOLD)
         state = state._replace(**changes, command=u, commanded_ns=time.command_ns,
-                        applied=applied, interval=time.interval,
-                        counted=state.counted if held else time.ahead)
-        return state, u, self._report(state, why, measured, target, done)
+                               applied=applied, interval=time.interval,
+                               counted=state.counted if kept else time.ahead)
+        return state, u, self._report(state, now, why, measured, target, done._replace(
+            at_range=done.at_range or at_range, at_rate=at_rate), u)
 
-    def _choose(self, state: State, verdict: Verdict, outside: float, time: StepTime
-                ) -> tuple[Supervisor, Target | None, LawResult | None]:
+    def _choose(self, state: State, acting: FallbackLevel, verdict: Verdict, outside: float,
+                time: StepTime) -> tuple[Supervisor, Target | None, LawResult | None]:
         """Find the level that acts; also give target and result of the last law tried, if any."""
         if verdict.fault is not None:
-            requested = LevelRequest(HOLD, verdict.fault, passing=True)
+            requested = self.order.request(Condition.STATE_UNKNOWN, cause=verdict.fault)
         else:
             requested = state.supervisor.allowed(self.order, outside, self.ranges)
             while (level := self.levels.get(requested.level)) and level.unusable is not None:
-                requested = self._failed(level, level.unusable)
+                requested = self.order.request(
+                    Condition.LAW_FAILED, level.name, cause=level.unusable)
         target, result = None, None
         while True:
             supervisor = state.supervisor.at(self.order, requested, time.now_ns)
             level = self.levels.get(supervisor.level or '')
             if level is None or state.estimate is None or state.setpoint.active is None:
                 return supervisor, target, result
-            estimate = self.estimation.transfer_estimate(
-                state.estimate, self.estimation.level(state.supervisor), level
-                ).under(self.estimation.feed_forward(state))
-            memory = state.law_memory if state.law == level.name else None
+            estimate = state.estimate if level is acting else self.estimation.transfer_estimate(
+                state.estimate, acting, level)
+            if state.disturbances is not None:
+                estimate = estimate.under(self.estimation.feed_forward(state))
             target, result = level.compute(
-                state.setpoint.active, estimate, memory, time.spacing, state.target,
-                state.own_command, self.estimation.pending(state, time.command_ns),
-                partial(setpoints.ahead, state.setpoint, self.controlled,
-                        self.tuning.setpoint_ramp, self.tuning.setpoint_filter_time, time.now_ns))
+                state.setpoint.active, estimate,
+                state.law_memory if state.law == level.name else None, time.spacing,
+                state.target, state.command if state.transfer is None else state.own_command,
+                PendingInputs(state.applied, time.command_ns, self.estimation.dead_ns), None
+                if not state.setpoint.scheduled else partial(
+                    setpoints.ahead, state.setpoint, self.best.controlled_states,
+                    self.tuning.setpoint_ramp, self.tuning.setpoint_filter_time, time.now_ns))
             if result.failure is not None:
-                requested = self._failed(level, result.failure, result.passing)
+                requested = self.order.request(
+                    Condition.LAW_MISSED if result.passing else Condition.LAW_FAILED,
+                    level.name, cause=result.failure)
                 continue
-            # a poor law is better than none
-            below = self.order.below(level.name)
-            if below not in self.levels or target is None or not level.model.failed_near(
-                    estimate.x, target.x):
+            # leave a law that failed near here, if there is one below
+            if target is None or level.model.verified_loops is None or (
+                    self.order.below(level.name) not in self.levels) or (
+                        not level.model.failed_near(estimate.x, target.x)):
                 return supervisor, target, result
-            requested = LevelRequest(below, reason(StatusCode.LOST_HERE, level=level.name))
-
-    def _failed(self, level: FallbackLevel, why: Reason, passing: bool = False) -> LevelRequest:
-        return LevelRequest(self.order.below(level.name), reason(
-            StatusCode.LAW_FAILED, level=level.name, cause=why), passing)
+            requested = self.order.request(Condition.LAW_LOST, level.name)
 
     def _recovery(self, state: State, supervisor: Supervisor, verdict: Verdict, outside: float,
                   time_ns: int) -> SafeStateRecovery | None:
         """Return how far the plant has come back where the safe input keeps it outside."""
-        if (supervisor.level != SAFE or supervisor.latched or verdict.fault is not None
-                or verdict.accepted is None):
+        if supervisor.latched or verdict.fault is not None or verdict.accepted is None:
             return None
         if outside > 0.0 and not moves_toward_nominal(
                 self.model, self.estimation.position(state.estimate, verdict.accepted.value),
@@ -304,11 +328,11 @@ class ControlStep(Configuration):
         kept_out = supervisor.bad_since_ns is None and supervisor.better_since_ns is None
         return SafeStateRecovery(outside, outside, time_ns) if kept_out and outside > 0.0 else None
 
-    def _act(self, state: State, supervisor: Supervisor, recovery: SafeStateRecovery | None,
-             result: LawResult | None, transfer: BumplessTransfer | None
-             ) -> tuple[dict[str, Any], Array, CommandReport]:
+    def _act(self, state: State, held: Array, supervisor: Supervisor,
+             recovery: SafeStateRecovery | None, result: LawResult | None,
+             transfer: BumplessTransfer | None) -> tuple[dict[str, Any], Array, CommandReport]:
         """Return the changes of the state, the command before limits, and its report."""
-        level, held = supervisor.level, self._last_command(state)
+        level = supervisor.level
         if result is None or result.u is None:
             done = NO_COMMAND if result is None else CommandReport(
                 result.info._replace(form=''), at_range=result.clipped, plan=result.plan)
@@ -327,28 +351,33 @@ class ControlStep(Configuration):
         return changes, result.u if offset is None else result.u + offset, CommandReport(
             result.info, offset, at_range=result.clipped, plan=result.plan)
 
-    def _last_command(self, state: State) -> Array:
-        return self.model.inputs.center if state.command is None else state.command
-
     def _outside(self, known: Estimate | None, y: Array) -> float:
         """Return how far a measurement is from the training data; NaN when it is none."""
         try:
             return self.model.distance(
-                self.estimation.position(known, y)) if all_finite(y) else np.nan
+                self.estimation.position(known, y)) if np.isfinite(y).all() else np.nan
         except np.linalg.LinAlgError:
             return np.nan
 
-    def _report(self, state: State, why: Reason | None,
+    def _report(self, state: State, acting: FallbackLevel, why: Reason | None,
                 measured: MeasurementReport = NOTHING_MEASURED, target: Target | None = None,
-                command: CommandReport = NO_COMMAND) -> StepReport:
-        active, manual = state.setpoint.active, state.mode is Mode.MANUAL
-        depth = len(self.order.levels) if manual else self.order.depth(state.supervisor.level)
+                command: CommandReport = NO_COMMAND, u: Array | None = None) -> StepReport:
+        """
+        Return the report of a step.
+
+        :param acting: in terms of whose model the estimate is.
+        :param u: (n_u,) new command; None where there is none.
+        """
+        if u is not None:
+            command = command._replace(outside=self.model.inputs.violation(u))
+        active, manual, order = state.setpoint.active, state.mode is Mode.MANUAL, self.order
+        depth = len(order.levels) if manual else order.places.get(state.supervisor.level, 0)
         known = None if state.estimate is None else EstimateReport(
-            state.estimate, self.estimation.level(state.supervisor).estimator)
+            state.estimate, acting.estimator)
         steady = () if target is None else (
             target.residual, self.model.states.to_physical(target.x),
             self.model.inputs.to_physical(target.u))
         aim = None if active is None else TargetReport(
-            active, self.controlled.violation(active), *steady)
-        return StepReport(state.mode, MANUAL if manual else self.order.levels[depth], depth, why,
+            active, self.best.controlled_states.violation(active), *steady)
+        return StepReport(state.mode, MANUAL if manual else order.levels[depth], depth, why,
                           measured, known, aim, command)

@@ -1,23 +1,65 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The supervisor: which control level acts, and when a better one may act again."""
+"""The supervisor: the table of fallbacks, which level acts, and when a better one may again."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import auto, Enum
 from functools import cached_property
 from typing import NamedTuple
 
-from koopman_ros.core.status import Reason, reason, StatusCode
+from koopman_ros.core.status import Reason, reason, StatusCode, Value
 from koopman_ros.core.units import NANOSECONDS
 
 # The levels after the laws, in this order.
 HOLD = 'hold'
 SAFE = 'safe'
 MANUAL = 'manual'  # in manual mode; no level of the supervisor
-# A threshold that was crossed counts as left only below this share of it.
-_HYSTERESIS = 0.5
+# Levels of a rule that depend on the law, or on the level that acts.
+BELOW = 'the next one below the law'
+SAME = 'the present one'
+
+
+class Condition(Enum):
+    """Why the best level does not act."""
+
+    STATE_UNKNOWN = auto()  #: a measurement is missing or rejected, or the calculation failed
+    LAW_FAILED = auto()  #: a law can never act, or gives no input
+    LAW_MISSED = auto()  #: a law gives no input at this sample, e.g. not in time
+    LAW_LOST = auto()  #: a law failed in the closed-loop test from a state like this
+    OUTSIDE = auto()  #: the state is further from the training data than the margin of a law
+    FAR_OUTSIDE = auto()  #: also further than the margin of the last law
+    HELD_TOO_LONG = auto()  #: no law could act for `hold_timeout`
+    RECOVERING = auto()  #: a better level is possible, but not yet for `recovery_time`
+    LATCHED = auto()  #: the safe input was reached with `safe_latch`
+    CLEARABLE = auto()  #: the same, and a law has been possible for `recovery_time`
+
+
+class Rule(NamedTuple):
+    """What follows from a condition."""
+
+    level: str  #: that acts
+    code: StatusCode | None  #: its reason, with that of the condition as its cause; None: the same
+    passing: bool = False  #: whether the level before acts again as soon as the condition ends
+    latched: bool = False  #: whether it stays until an operator clears it
+
+
+#: All fallbacks, and all conditions of each.
+RULES: Mapping[Condition, Rule] = {
+    Condition.STATE_UNKNOWN: Rule(HOLD, None, passing=True),
+    Condition.LAW_FAILED: Rule(BELOW, StatusCode.LAW_FAILED),
+    Condition.LAW_MISSED: Rule(BELOW, StatusCode.LAW_FAILED, passing=True),
+    Condition.LAW_LOST: Rule(BELOW, StatusCode.LOST_HERE),
+    Condition.OUTSIDE: Rule(BELOW, StatusCode.OUTSIDE_TRAINING),
+    Condition.FAR_OUTSIDE: Rule(SAFE, StatusCode.OUTSIDE_TRAINING),
+    Condition.HELD_TOO_LONG: Rule(SAFE, StatusCode.HELD_TOO_LONG),
+    Condition.RECOVERING: Rule(SAME, StatusCode.RECOVERING),
+    Condition.LATCHED: Rule(SAFE, StatusCode.SAFE_LATCHED, latched=True),
+    Condition.CLEARABLE: Rule(SAFE, StatusCode.LATCH_CLEARABLE, latched=True),
+}
 
 
 @dataclass(frozen=True)
@@ -37,6 +79,8 @@ class FallbackOrder:
     #: seconds that a better level must have been possible before it is taken
     recovery_time: float = 10.0
     safe_latch: bool = False  #: whether the safe input, once reached, stays until it is cleared
+    #: share of a margin below which the state must be for the law above to act again
+    hysteresis: float = 0.5
 
     def __post_init__(self) -> None:
         if list(self.margins) != sorted(self.margins):
@@ -49,18 +93,34 @@ class FallbackOrder:
         """The names of all levels, best first."""
         return (*self.laws, HOLD, SAFE)
 
-    def depth(self, level: str | None) -> int:
-        """Return the place in the order; 0 for None, and for a level that there is no more."""
-        return self.levels.index(level) if level in self.levels else 0
+    @cached_property
+    def places(self) -> Mapping[str | None, int]:
+        """The place of each level in the order; :meth:`get` with 0 for one that there is not."""
+        return {level: place for place, level in enumerate(self.levels)}
 
     def below(self, level: str) -> str:
         """Return the next level in the order."""
-        return self.levels[self.depth(level) + 1]
+        return self.levels[self.places.get(level, 0) + 1]
+
+    def request(self, condition: Condition, law: str | None = None, **values: Value
+                ) -> LevelRequest:
+        """
+        Return the level that follows from a condition, with its reason; see :data:`RULES`.
+
+        :param law: to which the condition applies, if it does to one.
+        :param values: of the reason.
+        """
+        rule, named = RULES[condition], {} if law is None else {'level': law}
+        cause = values.get('cause')
+        why = cause if rule.code is None else reason(rule.code, **values, **named)
+        assert isinstance(why, Reason)
+        return LevelRequest(self.below(law) if law is not None and rule.level == BELOW
+                            else rule.level, why, rule.passing)
 
     @property
     def return_margin(self) -> float:
         """The distance up to which a law takes over from the safe input."""
-        return _HYSTERESIS * self.margins[-1]
+        return self.hysteresis * self.margins[-1]
 
 
 class LevelRequest(NamedTuple):
@@ -102,15 +162,14 @@ class Supervisor:
 
         :param ranges: (name, lower, upper) of the trained range, for the reason.
         """
-        if not outside > 0.0:
-            return LevelRequest(order.laws[0])
-        for law, margin in reversed(tuple(zip(order.laws, order.margins, strict=True))):
-            below = order.below(law) if law != order.laws[-1] else SAFE
-            entered = order.depth(self.settled) >= order.depth(below)
-            least = _HYSTERESIS * margin if entered else margin
-            if outside > least:
-                return LevelRequest(below, reason(
-                    StatusCode.OUTSIDE_TRAINING, ranges=ranges, margin=least, level=law))
+        if outside > 0.0:
+            depth = order.places.get(self.settled, 0)
+            for law, margin in reversed(tuple(zip(order.laws, order.margins, strict=True))):
+                where = Condition.FAR_OUTSIDE if law == order.laws[-1] else Condition.OUTSIDE
+                below = SAFE if where is Condition.FAR_OUTSIDE else order.below(law)
+                least = order.hysteresis * margin if depth >= order.places[below] else margin
+                if outside > least:
+                    return order.request(where, law, ranges=ranges, margin=least)
         return LevelRequest(order.laws[0])
 
     def at(self, order: FallbackOrder, requested: LevelRequest, time_ns: int) -> Supervisor:
@@ -129,34 +188,35 @@ class Supervisor:
             cause = self.reason.cause if possible else requested.reason
         assert cause is not None
         ready = since is not None and (time_ns - since) / NANOSECONDS >= order.recovery_time
-        return Supervisor(SAFE, reason(
-            StatusCode.LATCH_CLEARABLE if ready else StatusCode.SAFE_LATCHED, cause=cause), None,
-            found.bad_since_ns, since, latched=True)
+        stays = order.request(
+            Condition.CLEARABLE if ready else Condition.LATCHED, cause=cause)
+        return Supervisor(stays.level, stays.reason, None, found.bad_since_ns, since, latched=True)
 
     def _next(self, order: FallbackOrder, requested: LevelRequest, time_ns: int) -> Supervisor:
         """Return the same without a latch."""
-        depth, bad_since, why = order.depth, None, requested.reason
+        places, bad_since = order.places, None
         if requested.level == HOLD:
+            assert requested.reason is not None
             bad_since = time_ns if self.bad_since_ns is None else self.bad_since_ns
-            too_long = (time_ns - bad_since) / NANOSECONDS > order.hold_timeout
-            if too_long:
-                assert why is not None
-                why = reason(StatusCode.HELD_TOO_LONG, cause=why, timeout=order.hold_timeout)
-            # the safe input once commanded stays until there is a law again
-            if too_long or (self.level == SAFE and self.bad_since_ns is not None):
-                requested = LevelRequest(SAFE, why)
-        settled = order.levels[depth(self.settled)]
-        if requested.passing and depth(settled) < depth(requested.level):
+            if (time_ns - bad_since) / NANOSECONDS > order.hold_timeout:
+                requested = order.request(
+                    Condition.HELD_TOO_LONG, cause=requested.reason, timeout=order.hold_timeout)
+            elif self.level == SAFE and self.bad_since_ns is not None:
+                # the safe input once commanded stays until there is a law again
+                requested = LevelRequest(SAFE, requested.reason)
+        settled = order.levels[places.get(self.resumes or self.level, 0)]
+        here, there, why = places[settled], places[requested.level], requested.reason
+        if requested.passing and here < there:
             return Supervisor(requested.level, why, settled, bad_since)
-        if requested.passing and requested.level == HOLD and depth(settled) > depth(HOLD):
-            # on its way to the safe input, nothing is gained by a hold
+        if requested.passing and requested.level == HOLD and here > there:
+            # skip HOLD while the input goes to the safe one
             return Supervisor(settled, why, None, bad_since)
-        if depth(requested.level) >= depth(settled):
+        if there >= here:
             return Supervisor(requested.level, why, None, bad_since)
         since = time_ns if self.better_since_ns is None else self.better_since_ns
         if (time_ns - since) / NANOSECONDS >= order.recovery_time:
             return Supervisor(requested.level, why, None, bad_since)
         waiting = self.reason
-        if waiting is not None and waiting.code is not StatusCode.RECOVERING:
-            waiting = reason(StatusCode.RECOVERING, cause=waiting)
+        if waiting is not None and waiting.code is not RULES[Condition.RECOVERING].code:
+            waiting = order.request(Condition.RECOVERING, cause=waiting).reason
         return Supervisor(settled, waiting, None, self.bad_since_ns, since)

@@ -78,7 +78,8 @@ def time_of_measurement(state: State, time_ns: int, countable: float | None
         since_ns = state.time_ns
     elapsed = 0.0 if since_ns is None else max(0.0, (time_ns - since_ns) / NANOSECONDS)
     # neither a gap nor a burst is the spacing of the samples, nor the first of them
-    spacing = min(usual_interval(state), elapsed)
+    usual = usual_interval(state)
+    spacing = min(usual, elapsed)
     counted, missed, interval, ahead = 0.0, 0, state.interval, 0.0
     if state.time_ns is not None:
         since_ns = state.time_ns
@@ -94,7 +95,7 @@ def time_of_measurement(state: State, time_ns: int, countable: float | None
             # the plant stood under the old command all through a gap
             seconds = min(since, 2.0 * state.interval)
             # a burst of measurements does not make the next regular one a gap
-            interval = max(seconds, 0.5 * usual_interval(state))
+            interval = max(seconds, 0.5 * usual)
             counted = min(seconds, elapsed, left)
     if countable is not None:
         counted = min(counted, countable)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dgees, dgeev, dgesv
+from scipy.linalg.lapack import dgees, dgeev, dgesv, dtrsen
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.status import StatusCode
@@ -214,8 +214,10 @@ def _stable_graph(H: Array, least: float = 0.0) -> Array:
     if not math.isfinite(size):
         raise np.linalg.LinAlgError('the Hamiltonian is not finite')
     # as scipy.linalg.schur, which takes three times as long for so few numbers
-    _, stable, real, _, vectors, _, info = dgees(lambda real, _: real < 0.0, H, sort_t=1)
-    if info != 0 or stable != n or not max(real[:n].tolist()) < -max(least, _AXIS_MARGIN * size):
+    triangle, _, real, _, vectors, _, failed = dgees(lambda *_: True, H)
+    _, vectors, real, _, stable, *_, moved = dtrsen(real < 0.0, triangle, vectors, job='N')
+    if failed or moved or stable != n or not max(real[:n].tolist()) < -max(
+            least, _AXIS_MARGIN * size):
         raise np.linalg.LinAlgError('no stable subspace of full dimension exists')
     P = _solved(vectors[n:, :n].T, vectors[:n, :n].T)
     return 0.5 * (P + P.T)

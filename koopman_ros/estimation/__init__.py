@@ -21,7 +21,7 @@ from koopman_ros.estimation.disturbance_observer import (
     equivalent_bias,
     MeasuredState,
 )
-from koopman_ros.estimation.history import Analysis, History, Instant
+from koopman_ros.estimation.history import Analysis, History, Instant, Pieces
 from koopman_ros.estimation.kalman_filters import ExtendedKalmanFilter, UnscentedKalmanFilter
 from koopman_ros.estimation.measured_disturbances import (
     check_disturbances,
@@ -39,7 +39,7 @@ ESTIMATORS: dict[str, type[Estimator] | str] = {
 
 __all__ = ['ESTIMATORS', 'Accepted', 'Analysis', 'AppliedInputs', 'DisturbanceObserver',
            'Estimate', 'Estimator', 'ExtendedKalmanFilter', 'History', 'Innovation', 'Instant',
-           'MeasuredDisturbances', 'MeasuredState', 'PendingInputs', 'Standstill',
+           'MeasuredDisturbances', 'MeasuredState', 'PendingInputs', 'Pieces', 'Standstill',
            'UnscentedKalmanFilter', 'Verdict', 'check', 'check_disturbances', 'equivalent_bias',
            'held_means', 'largest_bandwidth', 'with_applied',
            'with_commands']

@@ -14,9 +14,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from koopman_ros.core.arrays import all_finite, Array, pseudo_inverse
+from koopman_ros.core.arrays import Array, pseudo_inverse
 from koopman_ros.core.declaration import NoParameters
-from koopman_ros.core.integration import fastest_rate, integrate, STEPS
 from koopman_ros.core.signals import Outputs
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
@@ -77,7 +76,7 @@ class Estimate:
     @property
     def finite(self) -> bool:
         """Whether state, disturbance and covariance are finite numbers."""
-        return all_finite(self.x) and all_finite(self.w) and (
+        return all(map(math.isfinite, (*self.x.tolist(), *self.w.tolist()))) and (
             self.covariance is None or bool(np.isfinite(self.covariance).all()))
 
     def under(self, rate: Array | None) -> Estimate:
@@ -114,33 +113,6 @@ def with_commands(model: LiftedModel, estimate: Estimate, u: Array) -> Estimate:
     """Return an estimate whose states that are commands are those inputs (n_u,) that act."""
     return estimate if not model.commanded else replace(
         estimate, x=with_applied(model, estimate.x, u, model.commanded))
-
-
-def predicted_state(model: LiftedModel, estimate: Estimate, u: Array, seconds: float
-                    ) -> Array | None:
-    """
-    Integrate the state (n_x,) of an estimate under input and disturbance.
-
-    :param u: (n_u,) applied input, in scaled deviations.
-    :return: None after so long that it takes too many steps.
-    """
-    duration, steps = integration_steps(model, estimate, u, seconds)
-    return None if steps is None else integrate(
-        model.rate_under(u, estimate.w), estimate.x, duration, steps)
-
-
-def integration_steps(model: LiftedModel, estimate: Estimate, u: Array, seconds: float
-                      ) -> tuple[float, int | None]:
-    """
-    Return an interval in time units and the steps that it takes, or None for too many.
-
-    The fastest mode is that at the estimate or at the nominal point, to which it may return.
-    """
-    duration = seconds / model.seconds_per_time_unit
-    local = fastest_rate(model.rate_and_slope(estimate.x, u)[1])
-    # passes on a NaN, as the comparisons of Python do not
-    fastest = float(np.maximum(local, model.linearised.fastest_rate))
-    return duration, STEPS.count(duration, fastest)
 
 
 class Estimator(ABC):
@@ -201,8 +173,9 @@ class Estimator(ABC):
     def advance(self, estimate: Estimate, u: Array, seconds: float, *, covariance: bool = True
                 ) -> Estimate | None:
         """Predict as :meth:`predict`; states that are commands are those of `u` at once."""
-        predict = self.predict if covariance else self.predict_state
-        return predict(with_commands(self.model, estimate, u), u, seconds)
+        if self.model.commanded:
+            estimate = with_commands(self.model, estimate, u)
+        return (self.predict if covariance else self.predict_state)(estimate, u, seconds)
 
     def predict_over(self, estimate: Estimate, pieces: Iterable[tuple[float, Array]],
                      rate: Array | None) -> Estimate | None:
@@ -213,7 +186,7 @@ class Estimator(ABC):
         :param rate: (n_x,) due to the measured disturbances, or None.
         :return: the estimate then, without that rate, or None as from :meth:`predict`.
         """
-        begin = estimate.under(rate)
+        begin = estimate if rate is None else estimate.under(rate)
         now: Estimate | None = begin
         for seconds, u in pieces:
             now = now and self.advance(now, u, seconds)

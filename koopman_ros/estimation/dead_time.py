@@ -50,6 +50,8 @@ class AppliedInputs:
 
     def acting(self, time_ns: int, dead_ns: tuple[int, ...]) -> Array:
         """Return the input (n_u,) that acts on the plant from a time on."""
+        if len(self.values) == 1:
+            return self.values[0]
         rows = [max(0, bisect_right(self.times_ns, time_ns - dead) - 1) for dead in dead_ns]
         return self.values[rows[0]] if len(set(rows)) == 1 else np.array(
             [self.values[row][i] for i, row in enumerate(rows)])
@@ -62,11 +64,13 @@ class AppliedInputs:
     def pieces(self, start_ns: int, end_ns: int, dead_ns: tuple[int, ...]
                ) -> list[tuple[float, Array]]:
         """Return the durations in s and the inputs (n_u,) that act from one time to another."""
-        edges = sorted({start_ns, end_ns, *(
-            at for time in self.times_ns[1:] for dead in set(dead_ns)
-            if start_ns < (at := time + dead) < end_ns)})
+        edges = {start_ns, end_ns}
+        for dead in set(dead_ns):
+            first = bisect_right(self.times_ns, start_ns - dead, 1)
+            for time in self.times_ns[first:bisect_left(self.times_ns, end_ns - dead, first)]:
+                edges.add(time + dead)
         return [((end - begin) / NANOSECONDS, self.acting(begin, dead_ns))
-                for begin, end in itertools.pairwise(edges)]
+                for begin, end in itertools.pairwise(sorted(edges))]
 
 
 class PendingInputs(NamedTuple):

@@ -11,19 +11,18 @@ import numpy as np
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.signals import Outputs
 from koopman_ros.core.steady_state import steady_state
-from koopman_ros.estimation.base import Estimate, Estimator, LOST, predicted_state
+from koopman_ros.estimation.base import Estimate, Estimator, LOST
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
 
 def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
     """Integrate the model; None after too long, or where the estimate is lost."""
-    x = predicted_state(model, estimate, u, seconds)
+    x = model.integrated(estimate.x, u, estimate.w, seconds)
     if x is None:
         return None
     # far out the model's drift grows without bound, and corrections could not bring x back
-    within = all(abs(one) <= LOST * half for one, half in zip(
-        x.tolist(), model.states.half_widths.tolist(), strict=True))
+    within = (np.abs(x) <= LOST * model.states.half_widths).all()
     return Estimate(x, estimate.w) if within else None
 
 

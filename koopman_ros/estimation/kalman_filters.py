@@ -21,9 +21,7 @@ from koopman_ros.estimation.base import (
     Estimator,
     Innovation,
     INNOVATION_WINDOW,
-    integration_steps,
     LOST,
-    predicted_state,
 )
 from koopman_ros.estimation.dead_time import default_bandwidth
 from koopman_ros.model import LiftedModel
@@ -178,7 +176,7 @@ class ExtendedKalmanFilter(Estimator):
     def predict(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
         """Integrate the model, and the covariance with it; see :class:`Estimator`."""
         n = self.model.n_x
-        duration, steps = integration_steps(self.model, estimate, u, seconds)
+        duration, steps = self.model.integration_steps(estimate.x, u, seconds)
         if steps is None:
             return None
         P = (self.initial_covariance if estimate.covariance is None
@@ -192,7 +190,7 @@ class ExtendedKalmanFilter(Estimator):
 
     def predict_state(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
         """Integrate the model alone; None where the state is lost."""
-        x = predicted_state(self.model, estimate, u, seconds)
+        x = self.model.integrated(estimate.x, u, estimate.w, seconds)
         return None if x is None or not np.all(x * x <= self._lost) else replace(
             estimate, x=x, covariance=None)
 

@@ -80,7 +80,8 @@ class Coordinates:
 
     def array(self, what: str, values: ArrayLike) -> Array:
         """Return values (..., n) of these coordinates as an array; ValueError for another size."""
-        array = real(values, what)
+        array = values if isinstance(values, np.ndarray) and values.dtype == np.float64 else (
+            real(values, what))
         if array.shape[-1:] != (len(self.names),):
             raise ValueError(f'incompatible {what}: expected one number for each of '
                              f'{", ".join(self.names)} in the last axis, got {array.shape}')

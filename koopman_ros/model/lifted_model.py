@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import Array, frozen, pseudo_inverse, short_repr, show_printed
 from koopman_ros.core.datasets import PlantDescription
-from koopman_ros.core.integration import adaptive
+from koopman_ros.core.integration import adaptive, fastest_rate, integrate, STEPS
 from koopman_ros.core.solvers import decaying
 from koopman_ros.core.units import (
     check_time_unit,
@@ -449,6 +449,8 @@ class LiftedModel:
     def rate_and_slope(self, x: Array, u: Array) -> tuple[Array, Array]:
         """Evaluate f(x) + B(x) u (..., n_x) and its derivative by x (..., n_x, n_x)."""
         f, J = self.drift_and_jacobian(x)
+        if self.input_terms is None:
+            return f + u.dot(self.B.T), J
         return f + self.forcing(x, u), J + self.forcing_jacobian(x, u)
 
     def rate_under(self, u: Array, w: Array | float = 0.0) -> Callable[[Array], Array]:
@@ -462,6 +464,28 @@ class LiftedModel:
             constant = u.dot(self.B.T) + w
             return lambda x: self.drift(x) + constant
         return lambda x: self.drift(x) + self.forcing(x, u) + w
+
+    def integrated(self, x: Array, u: Array, w: Array, seconds: float) -> Array | None:
+        """
+        Integrate the state (n_x,) under a held input and a disturbance.
+
+        :param u: (n_u,) scaled deviations, and w (n_x,).
+        :return: None after so long that it takes too many steps.
+        """
+        rate, (duration, steps) = self.rate_under(u, w), self.integration_steps(x, u, seconds)
+        return None if steps is None else integrate(rate, x, duration, steps)
+
+    def integration_steps(self, x: Array, u: Array, seconds: float) -> tuple[float, int | None]:
+        """
+        Return an interval in time units and the steps that it takes, or None for too many.
+
+        The fastest mode is that at the state or at the nominal point, to which it may return.
+        """
+        duration = seconds / self.seconds_per_time_unit
+        local = fastest_rate(self.rate_and_slope(x, u)[1])
+        # passes on a NaN, as the comparisons of Python do not
+        fastest = float(np.maximum(local, self.linearised.fastest_rate))
+        return duration, STEPS.count(duration, fastest)
 
     @cached_property
     def linearised(self) -> LiftedModel:
@@ -528,11 +552,12 @@ class LiftedModel:
 
     def drift(self, x: Array) -> Array:
         """Evaluate f, the rate of the state without inputs: (..., n_x) -> same; f(0) = 0."""
-        x = self.states.array('state', x)
+        if not isinstance(x, np.ndarray) or x.shape[-1:] != (self.n_x,):
+            x = self.states.array('state', x)
         if self._weights is not None:
             return self.observables.features.lift(x).dot(self._weights.T)
         z, J = self.observables.lift_and_jacobian(x)
-        f = (self.onto_states(J) @ z.dot(self.A.T)[..., None])[..., 0]
+        f: Array = (self.onto_states(J) @ z.dot(self.A.T)[..., None])[..., 0]
         return f if self.pre_feedback is None else f - self.pre_feedback_rate(x)
 
     @cached_property
@@ -558,6 +583,8 @@ class LiftedModel:
         rest = (bend * (rate - J @ f)[..., None]).sum(axis=-3)
         slope = inverse @ (self.A @ J - (bend @ f[..., None, :, :])[..., 0]
                            + inverse.swapaxes(-1, -2) @ rest)
+        if self.pre_feedback is None:
+            return f[..., 0], slope
         return f[..., 0] - self.pre_feedback_rate(x), slope - self.pre_feedback_slope
 
     def drift_jacobian(self, x: Array) -> Array:

@@ -121,43 +121,36 @@ class NetworkObservables(Observables):
 
     def lift(self, x: Array) -> Array:
         """Evaluate z = N(x): (..., n_x) -> (..., n_z)."""
-        return self._lifted(x, self._hidden(x))
+        free = (np.tanh(x.dot(self.W.T) + self.b) - self.value_at_zero).dot(self.V.T)
+        return np.concatenate((x, free), axis=-1) if self.identity else np.asarray(free)
 
     def lift_and_jacobian(self, x: Array) -> tuple[Array, Array]:
         """Evaluate N(x) and J_N(x); shapes as in the interface."""
-        h = self._hidden(x)
-        return self._lifted(x, h), self._bent(1.0 - h * h) + self._of_states
+        h = np.tanh(x.dot(self.W.T) + self.b)
+        z: Array = (h - self.value_at_zero).dot(self.V.T)
+        J = (1.0 - h * h).dot(self._products).reshape(*x.shape[:-1], self.n_z, self.n_x)
+        return np.concatenate((x, z), axis=-1) if self.identity else z, J + self._of_states
 
     def lift_and_derivatives(self, x: Array) -> tuple[Array, Array, Array]:
         """Evaluate N(x), J_N(x) and the derivatives of J_N; shapes as in the interface."""
-        h, n = self._hidden(x), self.n_x
-        slope = 1.0 - h * h
+        h, n = np.tanh(x.dot(self.W.T) + self.b), self.n_x
         products = (self.W[:, :, None] * self.W[:, None, :]).reshape(-1, n * n)
-        bend = (self.V * (-2.0 * h * slope)[..., None, :]) @ products
+        bend = (self.V * (-2.0 * h * (1.0 - h * h))[..., None, :]) @ products
         states = np.zeros((*x.shape[:-1], self.n_z - len(self.V), n, n))
-        return (self._lifted(x, h), self._bent(slope) + self._of_states, np.concatenate(
-            (states, bend.reshape(*bend.shape[:-1], n, n)), axis=-3))
+        return *self.lift_and_jacobian(x), np.concatenate(
+            (states, bend.reshape(*bend.shape[:-1], n, n)), axis=-3)
 
     def secants(self, x: Array, x_ref: Array, w: Array) -> tuple[Array, Array, Array]:
         """Evaluate the secants, by divided differences of tanh and of its slope."""
-        h, h_ref, apart = self._hidden(x), self._hidden(x_ref), self.W.dot(x - x_ref)
+        h, h_ref = np.tanh(x.dot(self.W.T) + self.b), np.tanh(x_ref.dot(self.W.T) + self.b)
+        apart = self.W.dot(x - x_ref)
         # tanh a - tanh r = tanh(a - r) (1 - tanh a tanh r); the offset makes the ratio 1 at 0
         apart += np.copysign(1e-300, apart)
         secant = np.tanh(apart) / apart * (1.0 - h * h_ref)
-        J, M, H = self._bent(np.array((
-            1.0 - h * h, secant, -(h + h_ref) * secant * self.W.dot(w))))
+        J, M, H = np.array((
+            1.0 - h * h, secant, -(h + h_ref) * secant * self.W.dot(w))
+            ).dot(self._products).reshape(3, self.n_z, self.n_x)
         return J + self._of_states, M + self._of_states, H
-
-    def _hidden(self, x: Array) -> Array:
-        return np.tanh(x.dot(self.W.T) + self.b)
-
-    def _lifted(self, x: Array, h: Array) -> Array:
-        free: Array = (h - self.value_at_zero).dot(self.V.T)
-        return np.concatenate((x, free), axis=-1) if self.identity else free
-
-    def _bent(self, slope: Array) -> Array:
-        """Return V diag(slope) W below zeros for the states: (..., h) -> (..., n_z, n_x)."""
-        return slope.dot(self._products).reshape(*slope.shape[:-1], self.n_z, self.n_x)
 
     @cached_property
     def _of_states(self) -> Array:

@@ -88,7 +88,7 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights,
     """
     if closed(model):
         result = recentred(model, x, target, weights, **how)
-        if result.solved:
+        if result.riccati.failure is None:
             return result
     return averaged(model, x, target, weights, **how)
 
@@ -108,13 +108,13 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights,
     Arguments and result as in :func:`feedback`; of use where the input moves every mode of A that
     does not decay.
     """
-    n_x, n_z, forcing = model.n_x, model.n_z, target.forcing
-    B, D = model.input_matrix(x), _input_secant(model, x, target)
+    n_x, n_z, forcing, D = model.n_x, model.n_z, target.forcing, _input_secant(model, x, target)
     if model.pre_feedback is not None:
         forcing = forcing - model.pre_feedback_rate(target.x)
     J, M, H = model.observables.secants(x, target.x, forcing)
+    B = model.B
     if D is not None:
-        H = H + J.dot(D)
+        B, H = model.input_matrix(x), H + J.dot(D)
     if model.pre_feedback is not None:
         H = H - J.dot(model.pre_feedback_slope)
     if model.identity:
@@ -204,7 +204,7 @@ def _result(model: LiftedModel, found: Feedback, interval: float, u: Array | Non
             growth: float | None = None) -> LawResult:
     """Return the input of a feedback, or (n_u,) of its gain, unless it must not be used."""
     riccati = found.riccati
-    if not found.solved:
+    if riccati.failure is not None:
         growth = math.nan
     elif growth is None:
         growth = found.growth(interval / model.seconds_per_time_unit)
