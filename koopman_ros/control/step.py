@@ -196,18 +196,16 @@ class ControlStep:
 
     def _advanced(self, state: State, x: Array, time: StepTime) -> State:
         """Return the state with the set-point of now; it begins from `x` (n_x,)."""
-        setpoint = setpoints.advance(
-            state.setpoint, x[self.best.indices], self.best.controlled_states,
-            self.tuning.setpoint_ramp, time.now_ns, time.counted,
-            self.tuning.setpoint_filter_time)
+        advance = partial(
+            setpoints.advance, measured=x[self.best.indices], box=self.best.controlled_states,
+            ramp=self.tuning.setpoint_ramp, now_ns=time.now_ns,
+            lag=self.tuning.setpoint_filter_time)
+        setpoint = advance(state.setpoint, seconds=time.counted)
         if setpoint is state.setpoint:
             return state
         if setpoint.asked != state.setpoint.asked or state.setpoint.active is None:
             # a request from before the first measurement, or whose time has come
-            setpoint = setpoints.advance(
-                self.with_room(state, setpoint), x[self.best.indices],
-                self.best.controlled_states, self.tuning.setpoint_ramp, time.now_ns, 0.0,
-                self.tuning.setpoint_filter_time)
+            setpoint = advance(self.with_room(state, setpoint), seconds=0.0)
         return state._replace(setpoint=setpoint)
 
     def with_room(self, state: State, setpoint: setpoints.Setpoint) -> setpoints.Setpoint:

@@ -50,10 +50,6 @@ _FIGURES = {'cond': 'Condition number', 'rw': 'Held-out residual of the lift, re
 _FIGURES_OF_STATES = {'rollout_rmse': 'Held-out roll-out error (RMS)',
                       'noise': 'Measurement noise', 'free_run': 'Free-run error (RMS)'}
 _SAMPLES = 256  # random states of a box whose training states are not known
-# Of a prediction, for each sample; a model a thousand times faster needs a fifth.
-_MAX_STEPS = 1000
-# A prediction this far from the nominal point, in units of the scale, has diverged.
-_DIVERGED = 1e6
 # Of Gauss and Legendre on [0, 1].
 NODES, WEIGHTS = 0.5 * np.add(leggauss(5), [[1.0], [0.0]])
 
@@ -326,7 +322,8 @@ class LiftedModel:
             pre_feedback=None if self.pre_feedback is None else np.pad(
                 self.pre_feedback, ((0, n_d), (0, 0))))
 
-    def predict(self, x0: Array, inputs: Array, sample_period: float | Array) -> Array:
+    def predict(self, x0: Array, inputs: Array, sample_period: float | Array, *,
+                most: int = 1000, diverged: float = 1e6) -> Array:
         """
         Simulate the states under inputs that are held: dx/dt = f(x) + B(x) u.
 
@@ -336,6 +333,9 @@ class LiftedModel:
         :param inputs: (..., K, n_u) inputs, each held for one sample period, in input units, from
             the time at which they act on: :attr:`dead_time` does not count.
         :param sample_period: in the model's time unit, or (K,) periods.
+        :param most: steps in a sample; a model a thousand times faster needs a fifth.
+        :param diverged: distance from the nominal point, in units of the scale, at which a
+            prediction has diverged.
         :return: (..., K + 1, n_x) states at the samples, in state units.
         :raises RuntimeError: when the prediction diverges.
         :raises ValueError: for arrays that do not fit the model, or periods that are not above 0.
@@ -363,9 +363,9 @@ class LiftedModel:
 
                 # near a state where J_N is singular the steps may become ever shorter
                 end, arrived = adaptive(flat, xi.ravel(), period, rtol=1e-9, atol=1e-12,
-                                        most=_MAX_STEPS)
+                                        most=most)
             xi = end.y.reshape(shape)
-            if not (arrived and np.all(np.abs(xi) < _DIVERGED)):
+            if not (arrived and np.all(np.abs(xi) < diverged)):
                 raise RuntimeError(f'the prediction diverged after {len(path)} samples: keep the '
                                    'inputs within the trained range')
             path.append(xi)

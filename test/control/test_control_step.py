@@ -4,12 +4,16 @@
 """The control step: set-points, sensor failures, time and manual mode, one measurement each."""
 
 from dataclasses import replace
+from itertools import pairwise
 import math
+from pathlib import Path
+import sys
 import warnings
 
 import numpy as np
 import pytest
 
+import koopman_ros
 from koopman_ros.control import Arrival, Controller, Form, InputLimits, Mode, State, Tuning
 from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.setpoint import advance, HORIZON_NANOSECONDS, rejection, request, Setpoint
@@ -51,6 +55,28 @@ def measured(loop, state, kelvin, seconds):
 
 
 # One step.
+
+def test_a_step_is_a_short_list_of_calls_that_seldom_change_the_file():
+    loop, state, files = controller(observer_bandwidth=0.1), State(), []
+    noise = 0.01 * np.random.default_rng(1).standard_normal(60)
+    for second, error in enumerate(noise.tolist()):
+        state = measured(loop, state, START + error, second)[0]
+    package = str(Path(koopman_ros.__file__).parent)
+
+    def called(frame, event, _):
+        if event == 'call' and frame.f_code.co_filename.startswith(package):
+            files.append(frame.f_code.co_filename)
+
+    before = sys.getprofile()
+    sys.setprofile(called)
+    try:
+        report = measured(loop, state, START, len(noise))[2]
+    finally:
+        sys.setprofile(before)
+    assert (report.level, report.reason) == ('sdre', None)
+    assert len(files) < 140
+    assert sum(one != other for one, other in pairwise(files)) < 60
+
 
 def test_at_its_setpoint_the_loop_rests():
     state, command, report = controller().step(State(), np.array([START]), NOW)

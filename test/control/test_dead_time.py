@@ -12,9 +12,10 @@ import pytest
 from scipy.linalg import expm
 
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, State
+from koopman_ros.control.fallback import PredictionSettings
 from koopman_ros.control.laws import StateDependentRiccati
 from koopman_ros.core.status import StatusCode
-from koopman_ros.estimation import AppliedInputs, largest_bandwidth
+from koopman_ros.estimation import AppliedInputs, Estimate, largest_bandwidth, PendingInputs
 from koopman_ros.estimation.kalman_filters import uncertainty
 from koopman_ros.evaluation import at, exchange, perfect, simulate
 from koopman_ros.evaluation.optimal_cost import cost_along, Task
@@ -208,6 +209,13 @@ def test_a_mode_too_fast_to_predict_over_the_dead_time_is_a_failure_of_the_level
     assert report.level == ('sdre' if acts else 'hold')
     if not acts:
         assert report.reason.cause.code is StatusCode.NOT_PREDICTED
+        return
+    shorter = replace(loop.best, prediction=PredictionSettings(longest=0.9 * 100.0 * rate))
+    pending = PendingInputs(state.applied, SECOND, loop.estimation.dead_ns)
+    found = [level.compute(np.zeros(1), Estimate(np.zeros(1), np.zeros(1)), None, 1.0, None,
+                           state.command, pending)[1] for level in (loop.best, shorter)]
+    assert found[0].failure is None
+    assert found[1].failure.code is StatusCode.NOT_PREDICTED
 
 
 @pytest.mark.parametrize(('known', 'given', 'bandwidth'), [

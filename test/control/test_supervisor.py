@@ -20,7 +20,7 @@ from koopman_ros.control import (
     Tuning,
 )
 from koopman_ros.control.recovery import rest_under, SafeStateRecovery
-from koopman_ros.control.supervisor import FallbackOrder, LevelRequest
+from koopman_ros.control.supervisor import Condition, FallbackOrder, LevelRequest, RULES
 from koopman_ros.core.status import reason, StatusCode
 from koopman_ros.evaluation import exchange
 from koopman_ros.model import Coordinates, linearised_model, Provenance, TrainingStates
@@ -51,6 +51,38 @@ LINEAR = LevelRequest('linear', FAR)
 LATE = LevelRequest('linear', NO_LAW, passing=True)
 HOLD = LevelRequest('hold', NO_LAW)
 BLIND = LevelRequest('hold', reason(StatusCode.NO_MEASUREMENT), passing=True)
+
+
+NO_INPUT = reason(StatusCode.COMMAND_NOT_FINITE)
+OF_RULES = [
+    (Condition.STATE_UNKNOWN, None, BLIND.reason, 'hold', None, True),
+    (Condition.LAW_FAILED, 'sdre', NO_INPUT, 'linear', StatusCode.LAW_FAILED, False),
+    (Condition.LAW_FAILED, 'linear', NO_INPUT, 'hold', StatusCode.LAW_FAILED, False),
+    (Condition.LAW_MISSED, 'sdre', NO_INPUT, 'linear', StatusCode.LAW_FAILED, True),
+    (Condition.LAW_LOST, 'sdre', None, 'linear', StatusCode.LOST_HERE, False),
+    (Condition.OUTSIDE, 'sdre', None, 'linear', StatusCode.OUTSIDE_TRAINING, False),
+    (Condition.FAR_OUTSIDE, 'linear', None, 'safe', StatusCode.OUTSIDE_TRAINING, False),
+    (Condition.HELD_TOO_LONG, None, NO_LAW, 'safe', StatusCode.HELD_TOO_LONG, False),
+    (Condition.RECOVERING, None, FAR, None, StatusCode.RECOVERING, False),
+    (Condition.LATCHED, None, FAR, 'safe', StatusCode.SAFE_LATCHED, False),
+    (Condition.CLEARABLE, None, FAR, 'safe', StatusCode.LATCH_CLEARABLE, False)]
+
+
+@pytest.mark.parametrize(('condition', 'law', 'cause', 'level', 'code', 'passing'), OF_RULES)
+def test_each_condition_has_a_level_and_a_reason(condition, law, cause, level, code, passing):
+    found = ORDER.request(condition, law, **({} if cause is None else {'cause': cause}))
+    assert found.level == level or level is None
+    assert found.passing == passing
+    if code is None:
+        assert found.reason is cause
+    else:
+        assert (found.reason.code, found.reason.cause, found.reason.values.get('level')) == (
+            code, cause, law)
+
+
+def test_the_table_has_every_condition_and_latches_the_safe_input_alone():
+    assert set(RULES) == set(Condition) == {row[0] for row in OF_RULES}
+    assert {rule.level for rule in RULES.values() if rule.latched} == {'safe'}
 
 
 def walk(requests, order=ORDER):

@@ -1,16 +1,43 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The time grid of a horizon, and the transfer of a plan from one grid to the next."""
+"""The settings of a plan, its time grid, and the transfer of a plan from one grid to the next."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 
 import numpy as np
 
 from koopman_ros.core.arrays import Array, frozen
+from koopman_ros.core.integration import StepRule
+
+
+@dataclass(frozen=True)
+class PlanningSettings:
+    """The horizon of a plan, its integration, and when it has converged and may be used."""
+
+    fewest: int = 3  #: intervals
+    most: int = 30  #: intervals
+    horizon: float = 6.0  #: in time constants of the slowest mode of the closed loop
+    #: in time constants of the fastest growing mode of the plant, at most: over more of them the
+    #: effect of an input is too large to compute with
+    unstable: float = 8.0
+    #: longer steps than those of a filter: a plan is corrected at the next sample
+    rule: StepRule = field(default_factory=partial(StepRule, time_constants=0.7, most=32))
+    steps: int = 6  #: of integration at the nominal point, to which an interval grows
+    #: distance from the training data in half-ranges, from which on a simulated plan is of no use
+    diverged: float = 2.0
+    iterations: int = 12  #: quadratic programs at a sample, at most
+    converged: float = 1e-4  #: largest change of a scaled input of a plan that has converged
+    usable: float = 0.05  #: the same of one that may be used
+    #: every so many nodes, and the last, one is checked for its distance from the training data
+    checked: int = 3
+    rounding: float = 1e-9  #: error of that distance, in half-ranges
+    at_input: float = 1e-9  #: distance from a limit of a scaled input at which it is active
+    #: the same of a state, which follows from all inputs
+    at_state: float = 1e-6
 
 
 @dataclass(frozen=True)

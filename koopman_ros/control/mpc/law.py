@@ -8,12 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 import time
-from typing import TYPE_CHECKING
+from typing import ClassVar, TYPE_CHECKING
 
 import numpy as np
 
 from koopman_ros.control.laws.base import LaterInputs, Law, LawResult, SolutionInfo, Target
 from koopman_ros.control.laws.riccati import StateDependentRiccati
+from koopman_ros.control.mpc.grid import PlanningSettings
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.declaration import NO_LOWER, NO_UPPER, parameter, UNBOUNDED, value_column
 from koopman_ros.core.status import Reason, reason, StatusCode
@@ -25,12 +26,6 @@ if TYPE_CHECKING:
     from koopman_ros.control.mpc.planner import Planner
 
 _PACKAGE = 'daqp'
-# Largest change of a scaled input after which a plan has converged, and with which it may be used.
-_CONVERGED, _USABLE = 1e-4, 0.05
-_MAX_ITERATIONS = 12
-_ROUNDING = 1e-9  # error of a distance from the training data, in half-ranges
-_CHECKED = 3  # every third node, and the last, is checked for its distance from the training data
-
 
 @dataclass(frozen=True)
 class MPCParameters:
@@ -61,6 +56,7 @@ class RecedingHorizon(Law):
 
     Parameters = MPCParameters
     parameters: MPCParameters
+    settings: ClassVar[PlanningSettings] = PlanningSettings()
 
     def __init__(self, model: LiftedModel, tuning: Tuning, parameters: MPCParameters) -> None:
         super().__init__(model, tuning, parameters)
@@ -78,7 +74,8 @@ class RecedingHorizon(Law):
             self._unusable = reason(StatusCode.PACKAGE_MISSING, package=_PACKAGE)
             return
         self.planner = Planner(model, tuning, self.weights, *(
-            np.broadcast_to(bound, model.n_x) for bound in (parameters.lower, parameters.upper)))
+            np.broadcast_to(bound, model.n_x) for bound in (parameters.lower, parameters.upper)),
+            self.settings)
 
     def unusable(self) -> Reason | None:
         """Return that its package is not installed."""
@@ -112,10 +109,11 @@ class RecedingHorizon(Law):
         if not interval > 0.0:
             return self._riccati.compute(estimate, target, None, interval, previous)
         began, limit = time.perf_counter(), self.parameters.time_limit or math.inf
+        settings = self.settings
         try:
             problem = planner.problem(estimate, target, interval, previous, later)
             u, x = planner.first_guess(problem, memory)
-            for iteration in range(1, _MAX_ITERATIONS + 1):
+            for iteration in range(1, settings.iterations + 1):
                 found = planner.improve(problem, u, x)
                 if isinstance(found, Reason):
                     return LawResult(None, found, passing=True)
@@ -124,16 +122,17 @@ class RecedingHorizon(Law):
                 if iteration == 1 and spent > limit:
                     return LawResult(None, reason(
                         StatusCode.TOO_LATE, seconds=spent, deadline=limit), passing=True)
-                if change <= _CONVERGED or spent * (iteration + 1) / iteration > limit:
+                if change <= settings.converged or spent * (iteration + 1) / iteration > limit:
                     break
         except np.linalg.LinAlgError as error:
             return LawResult(None, reason(StatusCode.SINGULAR, matrix=str(error)))
-        if not change <= _USABLE:
+        if not change <= settings.usable:
             return LawResult(None, reason(StatusCode.PLAN_MOVES, iterations=iteration),
                              passing=True)
         # a state outside the training data may return from there
-        here, *ahead = self.model.distances(np.concatenate((x[:-1:_CHECKED], x[-1:]))).tolist()
-        if max(ahead) > max(self.margin, here) + _ROUNDING:
+        here, *ahead = self.model.distances(np.concatenate((
+            x[:-1:settings.checked], x[-1:]))).tolist()
+        if max(ahead) > max(self.margin, here) + settings.rounding:
             return LawResult(None, reason(
                 StatusCode.PLAN_OUTSIDE, outside=max(ahead), margin=self.margin))
         plan = planner.plan(problem, u, x)

@@ -16,30 +16,19 @@ from numpy.typing import NDArray
 from koopman_ros.control.laws.base import LaterInputs, Plan, Target, Weights
 from koopman_ros.control.laws.riccati import feedback
 from koopman_ros.control.mpc.condensing import condense, roll_out
-from koopman_ros.control.mpc.grid import HorizonGrid
+from koopman_ros.control.mpc.grid import HorizonGrid, PlanningSettings
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.integration import fastest_rate, integrate, StepRule
+from koopman_ros.core.integration import fastest_rate, integrate
 from koopman_ros.core.solvers import RiccatiSolution, solve_riccati
 from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.estimation import Estimate, held_means
 from koopman_ros.model import LiftedModel
 from koopman_ros.tuning import Tuning
 
-_MAX_INTERVALS, _MIN_INTERVALS = 30, 3
-# The horizon is so many time constants of the closed loop, unless the plant is unstable: over more
-# than this many of its time constants the effect of an input is too large to compute with.
-_CLOSED_LOOP, _UNSTABLE = 6.0, 8.0
-# Longer steps than those of a filter: a plan is corrected at the next sample.
-_RULE = StepRule(time_constants=0.7, most=32)
-# Intervals grow to so many steps of integration at the nominal point.
-_STEPS = 6
-_DIVERGED = 2.0  # distance in half-ranges, beyond which a simulated plan is of no use
-# Distance from a limit, scaled, at which it is active: of inputs, and of states, which follow from
-# all inputs.
-_AT_INPUT, _AT_STATE = 1e-9, 1e-6
-_INFINITY = 1e30  # of daqp
-_SOLVED = (1, 2)  # its exit flags: optimal, and optimal with a soft constraint violated
-_SOFT = 8  # its mark of a soft constraint
+# Of daqp.
+_INFINITY = 1e30
+_SOLVED = (1, 2)  # exit flags: optimal, and optimal with a soft constraint violated
+_SOFT = 8  # the mark of a soft constraint
 
 
 @dataclass(frozen=True)
@@ -82,7 +71,8 @@ class Planner:
     """
 
     def __init__(self, model: LiftedModel, tuning: Tuning, weights: Weights, state_lower: Array,
-                 state_upper: Array) -> None:
+                 state_upper: Array, settings: PlanningSettings) -> None:
+        self._settings = settings
         self._model, self._tuning, self._weights = model, tuning, weights
         inputs, limits = model.inputs, tuning.limits
         self._lower = np.maximum(inputs.to_deviation(limits.lower), -_INFINITY)
@@ -131,7 +121,8 @@ class Planner:
             grid.sample)
         rate = max(fastest_rate(self._slope), fastest,
                    fastest_rate(model.drift_jacobian(estimate.x)))
-        steps = _RULE.count(float(grid.lengths[-1]), rate) or _RULE.most
+        rule = self._settings.rule
+        steps = rule.count(float(grid.lengths[-1]), rate) or rule.most
         return PlanningProblem(
             estimate.x, estimate.w, target,
             None if previous is None else model.inputs.to_deviation(previous), grid, steps,
@@ -168,18 +159,20 @@ class Planner:
     def _new_grid(self, sample: float, after: float) -> HorizonGrid:
         A, B = self._slope, self._model.B
         found = self._regulator(A, B, sample)
-        horizon = _MAX_INTERVALS * sample
+        settings = self._settings
+        horizon = settings.most * sample
         closed = np.linalg.eigvals(A - B @ found.K).real
         if found.solved and np.all(closed < 0.0):
-            horizon = _CLOSED_LOOP / float(np.min(-closed))
+            horizon = settings.horizon / float(np.min(-closed))
         growing = float(np.max(np.linalg.eigvals(A).real))
         if growing > 0.0:
-            horizon = min(horizon, _UNSTABLE / growing)
+            horizon = min(horizon, settings.unstable / growing)
         horizon += after
-        count = int(min(max(math.ceil(horizon / sample), _MIN_INTERVALS), _MAX_INTERVALS))
+        count = int(min(max(math.ceil(horizon / sample), settings.fewest), settings.most))
         # modes much faster than those of the closed loop end it sooner
         fastest = fastest_rate(A)
-        longest = max(sample, _STEPS * _RULE.time_constants / fastest if fastest else math.inf)
+        longest = max(sample, settings.steps * settings.rule.time_constants / fastest
+                      if fastest else math.inf)
         return HorizonGrid.growing(horizon, sample, count, longest)
 
     def _new_cost(self, x_ref: tuple[float, ...], u_ref: tuple[float, ...], sample: float
@@ -234,7 +227,8 @@ class Planner:
             x = integrate(rate, x, length, problem.steps)
             inputs.append(u)
             nodes.append(x)
-            if not (np.isfinite(x).all() and model.distances(x[None])[0] < _DIVERGED):
+            if not (np.isfinite(x).all()
+                    and model.distances(x[None])[0] < self._settings.diverged):
                 # a straight line to the target is as good a guess
                 N = len(problem.change)
                 return np.tile(target.u, (N, 1)), np.linspace(problem.start, target.x, N + 1)
@@ -309,11 +303,11 @@ class Planner:
         return Plan(
             problem.grid.times * model.seconds_per_time_unit, model.states.to_physical(x),
             model.inputs.to_physical(u),
-            _active(first, first, self._lower, self._upper, _AT_INPUT),
+            _active(first, first, self._lower, self._upper, self._settings.at_input),
             _active(step, step, -problem.commanded(problem.change),
-                    problem.commanded(problem.change), _AT_INPUT),
+                    problem.commanded(problem.change), self._settings.at_input),
             _active(x[1:].min(axis=0), x[1:].max(axis=0), self._state_lower, self._state_upper,
-                    _AT_STATE))
+                    self._settings.at_state))
 
 
 def _active(least: Array, most: Array, lower: Array, upper: Array, tolerance: float) -> Array:

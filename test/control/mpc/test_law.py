@@ -233,6 +233,18 @@ def test_plan_with_active_limits_is_that_of_a_general_optimiser(change_after):
     assert simulated(planned)[0] == pytest.approx(best.fun, rel=1e-3)
 
 
+@pytest.mark.parametrize(('settings', 'code'), [
+    ({}, None), ({'iterations': 1, 'usable': 0.0}, StatusCode.PLAN_MOVES)])
+def test_settings_decide_when_a_plan_may_be_used(monkeypatch, settings, code):
+    monkeypatch.setattr(
+        RecedingHorizon, 'settings', replace(RecedingHorizon.settings, **settings))
+    _, model = OSCILLATOR
+    level = Controller(model, tuning(model)).levels['mpc']
+    found = level.compute(np.array([0.5, 0.0]), Estimate(np.zeros(2), np.zeros(2)), None, PERIOD,
+                          None, np.zeros(1))[1]
+    assert (found.failure and found.failure.code) is code
+
+
 @pytest.mark.parametrize('dead_time', [0.0, 0.5])
 def test_a_scheduled_setpoint_is_prepared_for(monkeypatch, dead_time):
     system, model = OSCILLATOR
