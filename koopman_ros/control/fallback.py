@@ -106,10 +106,6 @@ class FallbackLevel:
         inputs = self.model.inputs
         return inputs.to_deviation(self.limits.lower), inputs.to_deviation(self.limits.upper)
 
-    def controlled_of(self, x: Array) -> Array:
-        """Return the part (n_c,) of a state (n_x,) that has a set-point."""
-        return x[self.indices]
-
     def target(self, setpoint: Array, w: Array, start: Array | None) -> Target | None:
         """
         Find the steady state of a set-point (n_c,), in state units, under a disturbance (n_x,).

@@ -69,8 +69,8 @@ class Feasibility:
             alone = self._nearest(goal, asked)
             found = found if alone is None else alone
         cause = self._cause(goal)
-        held = self.box.center if found is None else level.controlled_of(
-            states.to_physical(found[:len(states)]))
+        held = self.box.center if found is None else (
+            states.to_physical(found[:len(states)])[level.indices])
         worst = int(np.argmax(np.abs(goal - held) / (self.box.upper - self.box.lower)))
         signal, value = self.box.names[worst], float(goal[worst])
         if found is None:
@@ -89,8 +89,8 @@ class Feasibility:
         found = self._nearest(goal, ~asked)
         if found is None or self._distance(found, goal) <= self.settings.rounding:
             return goal
-        return np.where(asked, goal, self.level.controlled_of(
-            self.level.model.states.to_physical(found[:self.level.model.n_x])))
+        states = self.level.model.states
+        return np.where(asked, goal, states.to_physical(found[:len(states)])[self.level.indices])
 
     def _nearest(self, goal: Array, moving: NDArray[np.bool_]) -> Array | None:
         """Return the steady state (n_x + n_u,) within range that is nearest to a set-point."""

@@ -67,7 +67,7 @@ def open_loop(level: FallbackLevel, outputs: Outputs, dead_time: float, interval
     estimate = _steady(level.estimator, outputs, interval, settled, most)
 
     def command(s: Array) -> Array:
-        target = level.target(level.controlled_of(model.states.center), s[n:], None)
+        target = level.target(model.states.center[level.indices], s[n:], None)
         if target is None:
             raise np.linalg.LinAlgError('no steady state')
         found = law.compute(replace(estimate, x=s[:n], w=s[n:]), target, None, interval, None)

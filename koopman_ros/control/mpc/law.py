@@ -73,9 +73,8 @@ class RecedingHorizon(Law):
         except ImportError:
             self._unusable = reason(StatusCode.PACKAGE_MISSING, package=_PACKAGE)
             return
-        self.planner = Planner(model, tuning, self.weights, *(
-            np.broadcast_to(bound, model.n_x) for bound in (parameters.lower, parameters.upper)),
-            self.settings)
+        self.planner = Planner(model, tuning, self.weights, self.settings, *(
+            np.broadcast_to(bound, model.n_x) for bound in (parameters.lower, parameters.upper)))
 
     def unusable(self) -> Reason | None:
         """Return that its package is not installed."""

@@ -70,8 +70,8 @@ class Planner:
     :param state_lower: (n_x,) soft limits of the states, to `state_upper`, in state units.
     """
 
-    def __init__(self, model: LiftedModel, tuning: Tuning, weights: Weights, state_lower: Array,
-                 state_upper: Array, settings: PlanningSettings) -> None:
+    def __init__(self, model: LiftedModel, tuning: Tuning, weights: Weights,
+                 settings: PlanningSettings, state_lower: Array, state_upper: Array) -> None:
         self._settings = settings
         self._model, self._tuning, self._weights = model, tuning, weights
         inputs, limits = model.inputs, tuning.limits
