@@ -96,7 +96,7 @@ class Controller:
 
     @cached_property
     def calculation(self) -> ControlStep:
-        """The list of what a step calculates by these parts."""
+        """The calculations of a step, by these parts."""
         return ControlStep(self.model, self.tuning, self.levels, self.order, self.estimation)
 
     @property

@@ -52,7 +52,7 @@ UNCERTAIN = 1  #: quality of a measurement; better is 0, worse are bad
 
 @dataclass(frozen=True)
 class EstimationSettings:
-    """When an estimate starts again, and what is assumed where nothing is given."""
+    """When an estimate starts again, and values where the tuning gives none."""
 
     #: time constants of the observer without an accepted measurement after which the state is
     #: not known

@@ -39,7 +39,7 @@ class Condition(Enum):
 
 
 class Rule(NamedTuple):
-    """What follows from a condition."""
+    """The consequence of a condition."""
 
     level: str  #: that acts
     code: StatusCode | None  #: its reason, with that of the condition as its cause; None: the same
@@ -95,7 +95,7 @@ class FallbackOrder:
 
     @cached_property
     def places(self) -> Mapping[str | None, int]:
-        """The place of each level in the order; :meth:`get` with 0 for one that there is not."""
+        """The place of each level in the order."""
         return {level: place for place, level in enumerate(self.levels)}
 
     def below(self, level: str) -> str:

@@ -32,7 +32,7 @@ class PlanningSettings:
     iterations: int = 12  #: quadratic programs at a sample, at most
     converged: float = 1e-4  #: largest change of a scaled input of a plan that has converged
     usable: float = 0.05  #: the same of one that may be used
-    #: every so many nodes, and the last, one is checked for its distance from the training data
+    #: nodes from one whose distance from the training data is checked to the next; the last, too
     checked: int = 3
     rounding: float = 1e-9  #: error of that distance, in half-ranges
     at_input: float = 1e-9  #: distance from a limit of a scaled input at which it is active
