@@ -18,7 +18,7 @@ from koopman_ros.model.steady_state import resting_state
 
 
 @dataclass(frozen=True)
-class RecoverySettings:
+class ReturnSettings:
     """When a plant under the safe input rests, and how the input leads it back."""
 
     #: share of the way from the safe input to the nominal one by which the input is ahead of the
@@ -45,7 +45,7 @@ class SafeStateRecovery:
     nearest: float  #: smallest distance since then
     since_ns: int  #: from when it has rested
     led: bool = False  #: whether the input has begun to move
-    settings: ClassVar[RecoverySettings] = RecoverySettings()
+    settings: ClassVar[ReturnSettings] = ReturnSettings()
 
     def moved(self, outside: float, time_ns: int, recovery_time: float, dead_time: float
               ) -> SafeStateRecovery | None:
