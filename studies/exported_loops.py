@@ -31,7 +31,7 @@ from koopman_ros.execution import backend_of, Notify
 from koopman_ros.export import c_code, compiled
 from koopman_ros.export.c_code import CODES
 from koopman_ros.export.command_line import loop
-from koopman_ros.export.cortex_m4 import measured
+from koopman_ros.export.cortex_m4 import measured, OPTIMISATIONS
 from koopman_ros.export.vectors import vectors, with_laws
 from koopman_ros.model import (
     Coordinates,
@@ -45,8 +45,10 @@ from koopman_ros.model.training_data import TrainingStates, VerifiedLoops
 from koopman_ros.tuning import DisturbanceLimits, InputLimits, SensorLimits, Tuning
 
 INTERVAL = 0.5  # s, of the random loops
+_SIZES = ('code', 'state', 'stack', 'instructions')
 _MEASURED, _CALLS = 10, 200  # commands of a law on an emulated Cortex-M4F, of so many calls
-FLAGS = ('-std=c99', '-Wall', '-Wextra', '-Wconversion', '-Werror', '-O1')
+FLAGS = ('-std=c99', '-Wall', '-Wextra', '-Wpedantic', '-Wconversion', '-Wdouble-promotion',
+         '-Wfloat-equal', '-Wshadow', '-Werror', '-O1')
 SANITIZERS = ('-fsanitize=address,undefined', '-fno-sanitize-recover')
 #: largest relative difference of a command that is not due to rounding
 TOLERANCE = 1e-9
@@ -127,7 +129,7 @@ def bundled_loops() -> Iterator[tuple[str, Controller, float]]:
     for path in sorted((config_directory() / 'models').glob('*.safetensors')):
         name = path.stem
         parameters = config_directory() / 'plants' / f'{_PLANTS.get(name, name)}.yaml'
-        found = loop(name, 'sdre', parameters)[1]
+        found = loop(name, 'sdre', parameters)
         # no analyser reports to a loop in C
         tuning = replace(found.tuning, analysis_delay=0.0 * found.tuning.analysis_delay)
         yield name, Controller(found.model, tuning, found.measured), _INTERVALS.get(name, 1.0)
@@ -157,9 +159,10 @@ def _row(samples: int, named: tuple[str, int], _: Notify) -> dict[str, Any]:
         calls = with_laws(found, list(vectors(found, _CALLS, interval, seed)), _MEASURED)
         with tempfile.TemporaryDirectory() as place:
             compiled(c_code(found, interval), Path(place), 'gcc', FLAGS)
-            cortex = measured(Path(place), calls)
-        row |= {} if cortex is None else {
-            size: getattr(cortex, size) for size in ('code', 'state', 'stack', 'instructions')}
+            cortex = {flag: measured(Path(place), 'controller', calls, flag)
+                      for flag in OPTIMISATIONS}
+        row |= {flag: {size: getattr(one, size) for size in _SIZES}
+                for flag, one in cortex.items() if one is not None}
     return row
 
 
@@ -177,17 +180,17 @@ def agreement_text(summary: Mapping[str, Any]) -> str:
             f'controller itself (by up to {max(row["rounding"][0] for row in rounded):.1g})')
 
 
-def sizes_text(summary: Mapping[str, Any]) -> str:
-    """Return memory and instructions of the bundled models on a Cortex-M4F, least to most."""
-    rows = [row for row in summary['loops'].values() if 'code' in row]
-
-    def least_to_most(name: str, unit: float) -> str:
-        values = [row[name] / unit for row in rows]
-        return f'{min(values):.2g} to {max(values):.2g}'
-
-    return (f'{least_to_most("code", 1e3)} kB of code, {least_to_most("state", 1e3)} kB of state, '
-            f'{least_to_most("stack", 1e3)} kB of stack, {least_to_most("instructions", 1e6)} '
-            'million instructions per step')
+def size_rows(summary: Mapping[str, Any]) -> list[str]:
+    """Return a table of memory and instructions of the bundled models on a Cortex-M4F."""
+    found = []
+    for flag in OPTIMISATIONS:
+        rows = [row[flag] for row in summary['loops'].values() if flag in row]
+        sizes = (f'{min(values):.2g} to {max(values):.2g}' for values in (
+            [row[name] / unit for row in rows]
+            for name, unit in zip(_SIZES, (1e3, 1e3, 1e3, 1e6), strict=True)))
+        if rows:
+            found.append(f'| `{flag}` | {" | ".join(sizes)} |')
+    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -205,7 +208,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name, found in backend.run(_row, items, shared=options.samples):
             summary['loops'][name] = found
             print(f'{name}: {found}', flush=True)
-    print(agreement_text(summary), sizes_text(summary), sep='\n')
+    print(agreement_text(summary), *size_rows(summary), sep='\n')
     if options.output is not None:
         options.output.mkdir(parents=True, exist_ok=True)
         (options.output / 'exported_loops.json').write_text(json.dumps(summary, indent=1) + '\n')

@@ -13,7 +13,6 @@ from koopman_ros.estimation.base import (
 from koopman_ros.estimation.dead_time import (
     AppliedInputs,
     held_means,
-    largest_bandwidth,
     PendingInputs,
 )
 from koopman_ros.estimation.disturbance_observer import (
@@ -41,5 +40,5 @@ __all__ = ['ESTIMATORS', 'Accepted', 'Analysis', 'AppliedInputs', 'DisturbanceOb
            'Estimate', 'Estimator', 'ExtendedKalmanFilter', 'History', 'Innovation', 'Instant',
            'MeasuredDisturbances', 'MeasuredState', 'PendingInputs', 'Pieces', 'Standstill',
            'UnscentedKalmanFilter', 'Verdict', 'check', 'check_disturbances', 'equivalent_bias',
-           'held_means', 'largest_bandwidth', 'with_applied',
+           'held_means', 'with_applied',
            'with_commands']

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from koopman_ros.core.arrays import Array, read_only
 from koopman_ros.core.units import NANOSECONDS
+from koopman_ros.tuning import largest_bandwidth
 
 # Stamp of an input that was applied before all others.
 _ALWAYS = -(1 << 62)
@@ -113,20 +114,3 @@ def default_bandwidth(modes: ArrayLike, dead_time: float) -> float:
     if dead_time > 0.0:
         return 0.5 * largest_bandwidth(dead_time, float(np.min(sizes)))
     return float(np.max(sizes)) if np.all(np.real(modes) < 0.0) else math.inf
-
-
-def largest_bandwidth(dead_time: float, slowest: float) -> float:
-    """
-    Return the bandwidth of an observer in 1/s with which its loop keeps a margin.
-
-    It grows with the dead time in time constants of the plant, whose decay damps the loop. For
-    first-order plants and laws with a gain of 0.7 to 2.3, in inverse gains of the plant, the
-    maximum sensitivity is at most 1.93, and dead time and gain may be twice as large as known;
-    the integral of the error after a load step is about that of a PI controller by the rules of
-    S. Skogestad (J. Process Control 13 (2003)), also where the dead time is 30 % shorter or longer
-    than known.
-
-    :param dead_time: the longest of the inputs, in s, above 0.
-    :param slowest: rate of the model's slowest mode, in 1/s.
-    """
-    return (1.0 + math.sqrt(1.0 + 8.0 * slowest * dead_time)) / (1.8 * dead_time)

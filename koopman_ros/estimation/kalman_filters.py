@@ -184,7 +184,8 @@ class ExtendedKalmanFilter(Estimator):
         # the disturbance wanders first, and then stays for the interval
         P[n:, n:] += seconds * self._intensity
         x, P = self._propagated(estimate.x, estimate.w, P, u, duration, steps)
-        if not np.all(np.diag(P)[:n] <= self._lost):
+        # far out a model's drift may grow without bound, which a covariance along it does not show
+        if not (np.all(np.diag(P)[:n] <= self._lost) and np.all(x * x <= self._lost)):
             return None
         return replace(estimate, x=x, covariance=0.5 * (P + P.T))
 

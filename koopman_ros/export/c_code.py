@@ -16,6 +16,7 @@ import math
 from pathlib import Path
 import re
 import subprocess
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,10 @@ from koopman_ros.model import NetworkObservables, PolynomialObservables
 from koopman_ros.model.lifted_model import NODES, WEIGHTS
 
 _LAWS = ('sdre', 'linear')
-# Parts that a model may lack, and their tables that the templates count.
+_FILES = ('controller.h', 'controller.c', 'test_vectors.c', 'timer_loop.c')
+_SIZES = ('NX', 'NU', 'NY', 'NC', 'ND', 'NP', 'LAWS', 'QUEUE', 'PERIOD_NS')  # in the header
+_COLUMNS = 99
+# Parts that a model may lack, and their tables that are counted.
 _OPTIONAL = r'\b(?:OBSERVABLES|INPUT_TERMS|TRAINING_STATES|VERIFIED_LOOPS)_[A-Z_]+'
 _COUNTED = {'N_TERMS': 'INPUT_TERMS_COEFFICIENTS', 'N_TRAINING': 'TRAINING_STATES_STATES',
             'N_LOOPS': 'VERIFIED_LOOPS_LOST'}
@@ -58,27 +62,88 @@ class ExportError(ValueError):
     """A loop cannot be exported; the message is one line for the user."""
 
 
-def c_code(controller: Controller, interval: float) -> dict[str, str]:
+def c_code(controller: Controller, interval: float, name: str = 'controller') -> dict[str, str]:
     """
-    Return ``controller.h``, ``controller.c`` and ``example.c`` of a loop.
+    Return header, code and two examples of a loop, by file name.
+
+    The code has only what the loop uses: the templates' ``#if`` of such a part are resolved.
 
     :param interval: shortest time between two calls in s, for which inputs under way are kept.
-    :raises ExportError: for a law, an estimator or a model that the C code does not support.
+    :param name: prefix of functions, types, macros and include guard, and of the code's files.
+    :raises ExportError: for a law, an estimator or a model that the C code does not support, or a
+        name that is no lower-case C identifier.
     """
-    texts = {name: template(name) for name in ('controller.h', 'controller.c', 'example.c')}
+    if not re.fullmatch('[a-z][a-z0-9_]{0,30}', name):
+        raise ExportError(f'name = {name!r} must be a C identifier of at most 31 lower-case '
+                          'letters, digits and underscores that begins with a letter, e.g. tank_1')
+    texts = {file: template(file) for file in _FILES}
     tables = _fields(controller, texts['controller.c']) | _tables(controller, interval)
+    used = _uses(controller, tables)
+    texts = {file: resolved(text, used) for file, text in texts.items()}
     about = [f'A control loop of {controller.model.provenance.plant}, exported by koopman_ros '
              f'{__version__}.', *(f'{role}: {", ".join(f"{name} [{unit}]" for name, unit in of)}'
                                   for role, of in signals(controller).items())]
-    # C has no arrays of no entries
-    sizes = {name: max(1, tables[name]) for name in (
-        'NX', 'NU', 'NY', 'NC', 'ND', 'NP', 'LAWS', 'QUEUE')}
+    named = set(re.findall(r'\b[A-Z_]+\b', re.sub(r'(?s)/\*.*?\*/', '', texts['controller.c'])))
     parts = {
-        'ABOUT': '\n'.join(f' * {line}' for line in about),
-        'SIZES': '\n'.join(f'#define KOOPMAN_{name} {value}' for name, value in sizes.items()),
-        'CODES': ',\n'.join(['    KOOPMAN_OK', *(f'    KOOPMAN_{code.name}' for code in CODES)]),
-        'TABLES': '\n'.join(_table(name, value) for name, value in tables.items())}
-    return {name: filled(text, parts) for name, text in texts.items()}
+        'ABOUT': '\n'.join(line for text in about for line in textwrap.wrap(
+            text, _COLUMNS, initial_indent=' * ', subsequent_indent=' *     ')),
+        'SIZES': '\n'.join(f'#define CONTROLLER_{size} {tables[size]}' for size in _SIZES),
+        'NOMINAL': ', '.join(map(_number, controller.measured.of(controller.model.states.center))),
+        'CODES': ',\n'.join(['    CONTROLLER_OK', *(
+            f'    CONTROLLER_{code.name}' for code in CODES)]),
+        'TABLES': '\n'.join(_table(table, value) for table, value in tables.items()
+                            if table in named and np.size(value))}
+    return {re.sub('^controller', name, file): prefixed(filled(text, parts), name)
+            for file, text in texts.items()}
+
+
+def resolved(text: str, used: Mapping[str, bool]) -> str:
+    """Return a template without the parts that are not used, and without the ``#if`` of others."""
+    lines, kept = [], [(True, False)]
+    for line in text.splitlines(keepends=True):
+        directive = re.match(r'#(if|else|endif)\b *(!?)(\w*)$', line)
+        if line.startswith('#if'):
+            known = directive is not None and directive[3] in used
+            if directive is not None and known:
+                kept.append((used[directive[3]] != bool(directive[2]), True))
+                continue
+            kept.append((True, False))
+        elif directive is not None and kept[-1][1]:
+            one, _ = kept.pop()
+            if directive[1] == 'else':
+                kept.append((not one, True))
+            continue
+        elif line.startswith('#endif'):
+            kept.pop()
+        if all(one for one, _ in kept):
+            lines.append(line)
+    return ''.join(lines)
+
+
+def prefixed(text: str, name: str) -> str:
+    """Return code with the name of a loop in place of that of the templates."""
+    return re.sub(r'\bCONTROLLER_', f'{name.upper()}_', re.sub(
+        r'(?<![a-zA-Z])controller(?=_|\.[ch]\b)', name, text))
+
+
+def _uses(controller: Controller, tables: Mapping[str, Any]) -> dict[str, bool]:
+    """Return which parts of the templates a loop uses."""
+    learned = not all(tables['LINEAR'])
+    read_out, terms = bool(tables['READ_OUT']), bool(tables['N_TERMS'])
+    monomials = bool(tables['N_PHI'] and not tables['NETWORK'])
+    closed_lift = learned and tables['CLOSED']
+    secants = closed_lift or (learned and read_out)
+    return {
+        'HAS_LEARNED_LAW': learned, 'CLOSED': closed_lift, 'HAS_SECANTS': secants,
+        'HAS_MONOMIALS': terms or monomials,
+        'HAS_QUADRATURE': learned and (not read_out or terms or (secants and monomials)),
+        'HAS_STORED_STATES': bool(tables['N_TRAINING'] or tables['N_LOOPS']),
+        'HAS_CURVES': len(tables['CURVE_VALUES']) > 0,
+        'HAS_PRE_FEEDBACK': bool(np.any(tables['PRE_FEEDBACK'])),
+        'BUMPLESS': controller.tuning.bumpless_transfer_time > 0.0,
+        **{name: bool(tables[name]) for name in (
+            'NETWORK', 'READ_OUT', 'N_PHI', 'N_TRAINING', 'N_LOOPS', 'N_TERMS', 'ND', 'KALMAN',
+            'DETERMINED', 'CONTROLS_ALL', 'RESTS')}}
 
 
 def template(name: str) -> str:
@@ -91,17 +156,19 @@ def filled(text: str, parts: Mapping[str, str]) -> str:
     return re.sub('@([A-Z]+)@', lambda found: parts[found[1]], text)
 
 
-def compiled(code: Mapping[str, str], folder: Path, compiler: str, flags: Sequence[str]) -> Path:
+def compiled(code: Mapping[str, str], folder: Path, compiler: str, flags: Sequence[str],
+             example: str = 'test_vectors.c') -> Path:
     """
-    Write the code of a loop to a folder, and compile its example; return the program.
+    Write the code of a loop to a folder, and compile an example; return the program.
 
     :raises subprocess.CalledProcessError: where the code does not compile.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in code.items():
         (folder / name).write_text(text)
-    program = folder / 'example'
-    subprocess.run([compiler, *flags, folder / 'controller.c', folder / 'example.c', '-lm', '-o',
+    program = folder / Path(example).stem
+    header = next(name for name in code if name.endswith('.h'))
+    subprocess.run([compiler, *flags, folder / f'{header[:-2]}.c', folder / example, '-lm', '-o',
                     program], check=True)
     return program
 
@@ -182,11 +249,11 @@ def _tables(controller: Controller, interval: float) -> dict[str, Any]:
     dead = [round(seconds * 1e9) for seconds in tuning.dead_times(model).tolist()]
     return {
         'NX': n, 'NU': m, 'NY': n_y, 'NC': len(controller.controlled), 'NZ': model.n_z,
-        'ND': len(model.disturbances), 'NP': 2 * n if kalman else 1, 'NXU': n + m,
+        'ND': len(model.disturbances), 'NP': 2 * n, 'NXU': n + m,
         'WIDTH': 1 + 2 * n if kalman else 1, 'N_PSI': psi.shape[1], 'N_PHI': psi.shape[1] - n,
-        'LAWS': len(controller.levels), 'QUEUE': math.ceil(max(dead) / 1e9 / interval) + 2,
-        'MOST': max(max(order, n + m, n_y, 2 * n * kalman) ** 2, order * m, n * max(
-            n + m, model.n_z, len(model.disturbances), 2 * n_y, 1 + 2 * n * kalman)),
+        'LAWS': len(controller.levels), 'PERIOD_NS': round(interval * 1e9),
+        'QUEUE': math.ceil(max(dead) / 1e9 / interval) + 2,
+        'ORDER': max(order, n, m), 'MAX_INVERTED': max((n + m) ** 2, n * model.n_z),
         'NETWORK': network, 'READ_OUT': model.readout is not None, 'CLOSED': closed(model),
         'KALMAN': kalman, 'DETERMINED': outputs.determine_state, 'CONTROLS_ALL': best.controls_all,
         'RESTS': np.count_nonzero(np.any(outputs.C != 0.0, axis=0)) == n_y, 'TIME_UNIT': unit,
@@ -218,7 +285,7 @@ def _tables(controller: Controller, interval: float) -> dict[str, Any]:
         'DEAD_TIME': dead, 'LONGEST_DEAD_TIME': max(dead),
         'SHORTEST_DEAD_TIME': min(dead), 'MARGIN': controller.order.margins,
         'CONTROLLED': [model.states.names.index(name) for name in best.controlled],
-        'LINEAR': [int(level.law.extrapolates) for level in controller.levels.values()],
+        'LINEAR': np.array([level.law.extrapolates for level in controller.levels.values()]),
         'OUTPUTS': outputs.C, 'FROM_OUTPUTS': np.linalg.pinv(outputs.C),
         'MEASURED': np.any(outputs.C != 0.0, axis=0), 'STATE_WEIGHT': np.diag(best.law.weights.Q),
         'INPUT_WEIGHT': np.diag(best.law.weights.R),
@@ -231,17 +298,22 @@ def _tables(controller: Controller, interval: float) -> dict[str, Any]:
 
 
 def _table(name: str, value: Any) -> str:
-    """Write a number as a macro, an array as a table; an empty one has one entry."""
+    """Write a number as a macro, an array as a table."""
     if np.ndim(value) == 0:
         return f'#define {name} {_number(value)}'
     flat = np.ravel(value)
     kind = 'int64_t' if name == 'DEAD_TIME' else 'int' if flat.dtype.kind != 'f' or re.search(
         'POWERS|LOST', name) else 'double'
-    entries = ', '.join(map(_number, flat)) or '0'
-    return f'static const {kind} {name}[] = {{{entries}}};'
+    entries = ', '.join(_number(int(one) if kind == 'int' else one) for one in flat)
+    shape = f' /* {np.shape(value)} */' if np.ndim(value) > 1 else ''
+    line = f'static const {kind} {name}[] = {{{entries}}};'
+    return line if not shape and len(line) <= _COLUMNS else (
+        f'static const {kind} {name}[] = {{{shape}\n' + textwrap.fill(
+            entries, _COLUMNS, initial_indent=4 * ' ', subsequent_indent=4 * ' ') + '\n};')
 
 
 def _number(value: Any) -> str:
     if isinstance(value, (bool, int, np.bool_, np.integer)):
         return str(int(value))
-    return 'INFINITY' if math.isinf(value) else repr(float(value))
+    number = 'HUGE_VAL' if math.isinf(value) else repr(abs(float(value)))
+    return f'-{number}' if value < 0.0 else number

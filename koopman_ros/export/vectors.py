@@ -14,7 +14,6 @@ from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.state import State, StepReport
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.integration import integrate, STEPS
-from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.export.c_code import CODES
 
@@ -24,7 +23,7 @@ _LONG = ('', 'silent', 'stuck', 'pushed', 'lost')
 
 @dataclass(frozen=True)
 class Call:
-    """The inputs of one call of ``koopman_step``; see ``controller.h``."""
+    """The inputs of one call of ``controller_step``; see ``controller.h``."""
 
     elapsed_ns: int
     measured: Array | None  #: (n_y,) None where nothing is received
@@ -37,7 +36,7 @@ class Call:
         none = np.full(len(controller.measured.names), np.nan)
         values = np.concatenate((
             none if self.measured is None else self.measured, self.setpoint, self.applied,
-            self.disturbance if len(self.disturbance) else [np.nan]))
+            self.disturbance))
         return [str(self.elapsed_ns), str(int(self.measured is not None)),
                 *map(repr, values.tolist())]
 
@@ -47,7 +46,7 @@ def columns(controller: Controller) -> list[str]:
     model = controller.model
     return ['elapsed_ns', 'received', *(f'{role} {name}' for role, names in (
         ('measured', controller.measured.names), ('setpoint', controller.controlled.names),
-        ('applied', model.inputs.names), ('disturbance', model.disturbances.names or ['none']),
+        ('applied', model.inputs.names), ('disturbance', model.disturbances.names),
         ('command', model.inputs.names)) for name in names), 'level', 'status', 'cause']
 
 
@@ -61,12 +60,15 @@ def answered(controller: Controller, state: State, call: Call, now_ns: int
     if call.measured is not None:
         return controller.step(state, call.measured, now_ns, call.applied,
                                disturbances=call.disturbance)
+    if state.command is None:
+        # the answer to a call before the first measurement acts from then on
+        state = controller.initialise(state, controller.safe_input)
     state, command, report = controller.hold(state, now_ns)
-    return state, controller.safe_input if command is None else command, report
+    assert command is not None
+    return state, command, report
 
 
-def answer_row(controller: Controller, command: Array, report: StepReport, started: bool
-               ) -> list[str]:
+def answer_row(command: Array, report: StepReport) -> list[str]:
     """Return command, level, status and cause as they stand in a table."""
     reason, codes = report.reason, [0, 0]
     if reason is not None:
@@ -74,11 +76,7 @@ def answer_row(controller: Controller, command: Array, report: StepReport, start
         while reason.cause is not None:
             reason = reason.cause
         codes[1] = CODES.index(reason.code) + 1
-    level = report.depth
-    if not started:
-        level = len(controller.levels) + 1
-        codes = [CODES.index(StatusCode.NO_MEASUREMENT) + 1] * 2
-    return [*(repr(float(value)) for value in command), str(level), *map(str, codes)]
+    return [*(repr(float(value)) for value in command), str(report.depth), *map(str, codes)]
 
 
 def vectors(controller: Controller, count: int, interval: float, seed: int = 0
@@ -133,7 +131,7 @@ def vectors(controller: Controller, count: int, interval: float, seed: int = 0
             inputs.to_physical(acting) if fault == 'stiff' else none,
             np.where(fault == 'lost', np.nan, d))
         state, command, report = answered(controller, state, call, now_ns)
-        yield call, answer_row(controller, command, report, state.command is not None)
+        yield call, answer_row(command, report)
 
 
 def with_laws(controller: Controller, rows: Sequence[tuple[Call, list[str]]], count: int

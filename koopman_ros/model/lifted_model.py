@@ -234,6 +234,12 @@ class LiftedModel:
                 if prefix + name in names}
 
     @cached_property
+    def modes(self) -> NDArray[np.complex128]:
+        """Modes (n_x,) of the drift at the nominal point in 1/s."""
+        slope = self.drift_jacobian(np.zeros(self.n_x)) / self.seconds_per_time_unit
+        return np.linalg.eigvals(slope).astype(np.complex128)
+
+    @cached_property
     def lag(self) -> Array:
         """Time constant (n_u,) of each input in s; 0 without a lag."""
         slope, found = self.drift_jacobian(np.zeros(self.n_x)), np.zeros(self.n_u)

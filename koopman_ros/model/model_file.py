@@ -74,7 +74,7 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
     check(model)
     about, tensors = _description(model), _tensors(model)
     metadata = json.dumps({'format_version': FORMAT_VERSION, 'model': about,
-                           'sha256': _checksum(about, tensors)}, sort_keys=True, allow_nan=False)
+                           'sha256': digest(model)}, sort_keys=True, allow_nan=False)
     write_atomically(Path(path), safetensors.numpy.save(tensors, metadata={_KEY: metadata}))
 
 
@@ -101,6 +101,11 @@ def load_with_digest(path: str | os.PathLike[str]) -> tuple[LiftedModel, str]:
         raise ModelFileError(f'{path} is not a usable model file: {reason}; restore it from a '
                              'backup, or train the model again') from error
     return model, hashlib.sha256(content).hexdigest()
+
+
+def digest(model: LiftedModel) -> str:
+    """Return the SHA-256 of all that a model consists of, as its file has it, in hexadecimal."""
+    return _checksum(_description(model), _tensors(model))
 
 
 def check(model: LiftedModel) -> None:

@@ -11,14 +11,13 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from koopman_ros.control import Controller, LAWS
 from koopman_ros.control.laws import Law
 from koopman_ros.core.declaration import nested, of_other_states, parameter, per_signal
 from koopman_ros.core.plugins import plugin_class, short_name
 from koopman_ros.core.signals import Outputs
-from koopman_ros.estimation import Estimator, ESTIMATORS, largest_bandwidth
+from koopman_ros.estimation import Estimator, ESTIMATORS
 from koopman_ros.model import LiftedModel
 from koopman_ros.parameters.signal_topics import (
     AnalysisPlaces,
@@ -35,7 +34,7 @@ from koopman_ros.parameters.signal_topics import (
     system_of,
 )
 from koopman_ros.parameters.table import ConfigurationError, ParameterTable
-from koopman_ros.tuning import Tuning
+from koopman_ros.tuning import largest_bandwidth, time_defaults, Tuning
 
 #: parameters in the file of a whole loop that a controller does not need: its model has them
 OF_THE_MODEL = ('disturbances_measured',)
@@ -134,26 +133,17 @@ def _plugin_parameters(given: Mapping[str, Any]) -> dict[str, type[Any]]:
     return found
 
 
-def _modes(model: LiftedModel) -> NDArray[np.complex128]:
-    return np.asarray(np.linalg.eigvals(
-        model.drift_jacobian(np.zeros(model.n_x))) / model.seconds_per_time_unit)
-
-
 def _dynamics(model: LiftedModel) -> dict[str, Any]:
     """Return defaults for a model's modes: an unstable plant cannot wait, and needs a plan."""
-    modes = _modes(model)
+    modes = model.modes
     fastest, slowest = float(np.max(np.abs(modes))), float(np.min(np.abs(modes)))
-    stable = bool(np.all(modes.real < 0.0)) and fastest > 0.0
     levels = {} if np.all(modes.real <= 0.0) else {'fallback_order': ('mpc', 'sdre', 'linear')}
     # a window, a fifth of it, is to show the slowest mode, and not to let an unstable one run off
     shown = max(slowest, 0.1 * fastest, float(np.max(modes.real)), 1e-3)
     return {**levels,
             'sample_time': (
                 min(max(float(f'{0.1 / fastest:.2g}'), 0.01), 1.0) if fastest > 0.0 else 1.0),
-            'model_check_length': min(float(f'{10.0 / shown:.2g}'), 86400.0),
-            'bumpless_transfer_time': (
-                min(float(f'{0.5 / fastest:.2g}'), 86400.0) if stable else 0.0),
-            'observer_bandwidth': min(float(f'{fastest:.2g}'), 1000.0) if stable else 0.0}
+            'model_check_length': min(float(f'{10.0 / shown:.2g}'), 86400.0)}
 
 
 def _longest_dead_time(model: LiftedModel, given: Mapping[str, Any]) -> float:
@@ -196,10 +186,12 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
                      for name, scale in zip(one.names, one.scale.tolist(), strict=True)
                      if name in signals.units}
     defaults |= {**own, 'system': system}
-    if dead_time := _longest_dead_time(model, {**defaults, **given}):
-        bandwidth = largest_bandwidth(dead_time, float(np.min(np.abs(_modes(model)))))
-        defaults['observer_bandwidth'] = min(
-            defaults['observer_bandwidth'], float(f'{bandwidth:.2g}'))
+    dead_time = _longest_dead_time(model, {**defaults, **given})
+    defaults = {**time_defaults(model, dead_time), **defaults}
+    if dead_time > 0.0:
+        # of a plant's file, too
+        defaults['observer_bandwidth'] = min(defaults['observer_bandwidth'], float(
+            f'{largest_bandwidth(dead_time, float(np.min(np.abs(model.modes)))):.2g}'))
     return ParameterTable(
         ControllerParameters, partial(_cross_check, signals),
         lambda values: built(values, model),

@@ -15,7 +15,7 @@ from koopman_ros.control import Controller, InputLimits, SetpointRequest, State
 from koopman_ros.control.fallback import PredictionSettings
 from koopman_ros.control.laws import StateDependentRiccati
 from koopman_ros.core.status import StatusCode
-from koopman_ros.estimation import AppliedInputs, Estimate, largest_bandwidth, PendingInputs
+from koopman_ros.estimation import AppliedInputs, Estimate, PendingInputs
 from koopman_ros.estimation.kalman_filters import uncertainty
 from koopman_ros.evaluation import at, exchange, perfect, simulate
 from koopman_ros.evaluation.optimal_cost import cost_along, Task
@@ -29,7 +29,7 @@ from koopman_ros.plants import (
     Process,
     ReactorParameters,
 )
-from koopman_ros.tuning import Tuning
+from koopman_ros.tuning import largest_bandwidth, Tuning
 from support.closed_loops import COOLANT, FOULED, REACTOR, SECOND, SETPOINT, shipped, START
 
 REACTOR_MODEL = shipped('reactor_nz4')

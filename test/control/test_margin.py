@@ -11,9 +11,10 @@ import pytest
 
 from koopman_ros.control import Controller, State, Tuning
 from koopman_ros.core.units import NANOSECONDS as SECOND
-from koopman_ros.estimation import Estimate, largest_bandwidth
+from koopman_ros.estimation import Estimate
 from koopman_ros.model import Coordinates, linearised_model, Provenance
 from koopman_ros.parameters.controller import built, table_of
+from koopman_ros.tuning import largest_bandwidth
 from support.closed_loops import shipped
 
 

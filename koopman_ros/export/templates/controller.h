@@ -3,8 +3,8 @@
  *
 @ABOUT@
  */
-#ifndef KOOPMAN_CONTROLLER_H
-#define KOOPMAN_CONTROLLER_H
+#ifndef CONTROLLER_H
+#define CONTROLLER_H
 
 #include <stdint.h>
 
@@ -12,11 +12,13 @@
 extern "C" {
 #endif
 
+/* Numbers of states, inputs, measured signals, set-points and measured disturbances; size of a
+ * covariance; laws; inputs under way that are kept; shortest time between two calls */
 @SIZES@
 
 /* The control level that acts; the levels of the laws are numbered from the best one, 0. */
 enum {
-    KOOPMAN_HOLD = KOOPMAN_LAWS, KOOPMAN_SAFE
+    CONTROLLER_HOLD = CONTROLLER_LAWS, CONTROLLER_SAFE
 };
 
 enum {
@@ -25,61 +27,78 @@ enum {
 
 /* Signals are in the order of the lists above and in their units. */
 typedef struct {
-    int64_t elapsed_ns;                 /* since the call before; does not count at the first */
-    int received;                       /* 0: there is no new measurement */
-    double measured[KOOPMAN_NY];
-    double setpoint[KOOPMAN_NC];        /* NAN: no request, the one before stays */
-    double applied[KOOPMAN_NU];         /* measured inputs; NAN: not measured */
-    double disturbance[KOOPMAN_ND];     /* measured disturbances; NAN: the one before stays */
-} koopman_inputs;
+    int64_t elapsed_ns;     /* since the last call; below 0 counts as 0, above 73 years as these */
+    int received;           /* 0: there is no new measurement */
+    double measured[CONTROLLER_NY];
+    double setpoint[CONTROLLER_NC];     /* NAN: no request, the one before stays */
+    double applied[CONTROLLER_NU];      /* measured inputs; NAN: not measured */
+#if ND
+    double disturbance[CONTROLLER_ND];  /* measured disturbances; NAN: the one before stays */
+#endif
+} controller_inputs;
 
 typedef struct {
-    double command[KOOPMAN_NU];         /* finite, and within range and rate limit */
+    /* finite, within range, and within the rate limit of the command before or of the inputs at
+     * the start */
+    double command[CONTROLLER_NU];
     int level;
-    int status, cause;                  /* why no better level acts, and the reason behind that */
-    int setpoint_rejected;               /* 1: outside the trained range, the one before stays */
-    double state[KOOPMAN_NX];           /* estimated; NAN before the first measurement */
-    double setpoint[KOOPMAN_NC];        /* active, on its ramp; NAN before the first measurement */
-} koopman_outputs;
+    int status, cause;      /* why no better level acts, and the reason behind that */
+    int setpoint_rejected;  /* 1: outside the trained range, the one before stays */
+    double state[CONTROLLER_NX];        /* estimated; NAN before the first measurement */
+    double setpoint[CONTROLLER_NC];     /* on its ramp; NAN before the first measurement */
+} controller_outputs;
 
 /* All that is remembered from one call to the next; none of it is to be changed. */
 typedef struct {
     int level, resumes, status, cause;
     int64_t bad_since, better_since;
-} koopman_supervisor;
+} controller_supervisor;
 
 typedef struct {
     int known;
-    double x[KOOPMAN_NX], w[KOOPMAN_NX], P[KOOPMAN_NP * KOOPMAN_NP];
-} koopman_estimate;
+    double x[CONTROLLER_NX], w[CONTROLLER_NX];
+#if KALMAN
+    double P[CONTROLLER_NP * CONTROLLER_NP];
+#endif
+} controller_estimate;
 
 typedef struct {
-    int64_t now, measured_at, commanded_at;
+    int64_t measured_at, commanded_at;  /* times are in ns, relative to the last call */
     int commanded, law, jumped, active, transferring;
-    double interval, command[KOOPMAN_NU];
+    double interval, command[CONTROLLER_NU];
     int queued;
-    int64_t applied_at[KOOPMAN_QUEUE];
-    double applied[KOOPMAN_QUEUE][KOOPMAN_NU];
-    double requested[KOOPMAN_NC], setpoint[KOOPMAN_NC], ramped[KOOPMAN_NC];
-    int64_t accepted_at, still_since[KOOPMAN_NY], seen_since[KOOPMAN_NY];
-    int unmeasured[KOOPMAN_ND];
-    int64_t disturbed_at[KOOPMAN_ND];
-    double disturbance[KOOPMAN_ND];
-    double accepted[KOOPMAN_NY], travel[KOOPMAN_NY], resolution[KOOPMAN_NY], still_w[KOOPMAN_NX];
-    koopman_estimate estimate;
-    koopman_supervisor supervisor;
+    int64_t applied_at[CONTROLLER_QUEUE];
+    double applied[CONTROLLER_QUEUE][CONTROLLER_NU];
+    double requested[CONTROLLER_NC], setpoint[CONTROLLER_NC], ramped[CONTROLLER_NC];
+    int64_t accepted_at, still_since[CONTROLLER_NY], seen_since[CONTROLLER_NY];
+#if ND
+    int unmeasured[CONTROLLER_ND];
+    int64_t disturbed_at[CONTROLLER_ND];
+    double disturbance[CONTROLLER_ND];
+#endif
+    double accepted[CONTROLLER_NY], travel[CONTROLLER_NY], resolution[CONTROLLER_NY];
+    double still_w[CONTROLLER_NX];
+    controller_estimate estimate;
+    controller_supervisor supervisor;
     int recovering, led;
     double farthest, nearest;
     int64_t resting_since;
-    double offset[KOOPMAN_NU], feed[KOOPMAN_NU];
-    double target[KOOPMAN_NX + KOOPMAN_NU];
-} koopman_state;
+#if BUMPLESS
+    double offset[CONTROLLER_NU], feed[CONTROLLER_NU];
+#endif
+    double target[CONTROLLER_NX + CONTROLLER_NU];
+} controller_state;
 
-/* Start; applied (KOOPMAN_NU) are the inputs that act already, or NULL where they are unknown. */
-void koopman_init(koopman_state *state, const double *applied);
+/* Start; applied (CONTROLLER_NU) are the inputs that act already. With NULL they are unknown:
+ * calls before the first measurement are answered by the safe input. */
+void controller_init(controller_state *state, const double *applied);
 
-/* Find the command; state is used and renewed. Without a command so far it is the safe input. */
-void koopman_step(koopman_state *state, const koopman_inputs *inputs, koopman_outputs *outputs);
+/* Find the command; state is used and renewed. */
+void controller_step(controller_state *state, const controller_inputs *inputs,
+                     controller_outputs *outputs);
+
+/* The safe input (CONTROLLER_NU), for a watchdog and a stop */
+void controller_safe_input(double *command);
 
 #ifdef __cplusplus
 }

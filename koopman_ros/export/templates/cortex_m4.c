@@ -4,7 +4,7 @@
  * Start on QEMU's mps2-an386, and a wrapper that measures each step: with -icount shift=0 an
  * instruction takes 1 ns, and the timer counts at 25 MHz.
  */
-#include <controller.h>
+#include "controller.h"
 
 #include <stdio.h>
 
@@ -12,8 +12,9 @@
 #define TIMER ((volatile uint32_t *)0xE000E010u)
 
 extern void _start(void);
-extern void __real_koopman_step(koopman_state *, const koopman_inputs *, koopman_outputs *);
-void __wrap_koopman_step(koopman_state *, const koopman_inputs *, koopman_outputs *);
+extern void __real_controller_step(controller_state *, const controller_inputs *,
+                                   controller_outputs *);
+void __wrap_controller_step(controller_state *, const controller_inputs *, controller_outputs *);
 
 static void reset(void)
 {
@@ -26,14 +27,15 @@ static void reset(void)
 __attribute__((section(".vectors"), used)) static void (*const vectors[])(void) = {
     (void (*)(void))0x003FF000u, reset};
 
-void __wrap_koopman_step(koopman_state *s, const koopman_inputs *in, koopman_outputs *out)
+void __wrap_controller_step(controller_state *s, const controller_inputs *in,
+                            controller_outputs *out)
 {
     static uint32_t most, deepest;
     uint32_t mark, count, deep;
     volatile uint32_t *top = (volatile uint32_t *)(uintptr_t)&mark, *below = top - STACK / 4;
     for (volatile uint32_t *p = below; p < top - 64; p++) *p = 0xA5A5A5A5u;
     mark = TIMER[2];
-    __real_koopman_step(s, in, out);
+    __real_controller_step(s, in, out);
     count = ((mark - TIMER[2]) & 0xFFFFFFu) * 40u;
     while (*below == 0xA5A5A5A5u) below++;
     deep = (uint32_t)(top - below) * 4u;
