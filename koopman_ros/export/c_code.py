@@ -66,12 +66,12 @@ def c_code(controller: Controller, interval: float, name: str = 'controller') ->
     """
     Return header, code and two examples of a loop, by file name.
 
-    The code has only what the loop uses: the templates' ``#if`` of such a part are resolved.
+    The code has only the parts of the templates that the loop uses: their ``#if`` are resolved.
 
     :param interval: shortest time between two calls in s, for which inputs under way are kept.
     :param name: prefix of functions, types, macros and include guard, and of the code's files.
     :raises ExportError: for a law, an estimator or a model that the C code does not support, or a
-        name that is no lower-case C identifier.
+        name other than a C identifier in lower case.
     """
     if not re.fullmatch('[a-z][a-z0-9_]{0,30}', name):
         raise ExportError(f'name = {name!r} must be a C identifier of at most 31 lower-case '

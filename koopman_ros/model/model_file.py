@@ -104,7 +104,7 @@ def load_with_digest(path: str | os.PathLike[str]) -> tuple[LiftedModel, str]:
 
 
 def digest(model: LiftedModel) -> str:
-    """Return the SHA-256 of all that a model consists of, as its file has it, in hexadecimal."""
+    """Return the SHA-256 of a model, which its file contains, in hexadecimal."""
     return _checksum(_description(model), _tensors(model))
 
 

@@ -1431,7 +1431,7 @@ static int usable(const controller_estimate *e)
 /* Predict an estimate under an input, in its units, for some seconds, by Runge-Kutta steps, with
  * or without its covariance P: with F the derivative of (x, w) by what they were,
  * P = F (P + W t) F'. Returns 0 where it is lost.
- * Python: estimation.base.predicted_state */
+ * Python: model.lifted_model.LiftedModel.integrated */
 static int predict_estimate(int linear, controller_estimate *e, const double *input,
                             double seconds, int covariance)
 {
@@ -1743,7 +1743,7 @@ static int predict_over(const controller_state *s, int linear, int64_t begin, in
 }
 
 /* Predict an estimate up to now, where there is one; as uncertain as at first where it is lost.
- * Python: control.estimates.StateEstimation.predict */
+ * Python: control.estimates.StateEstimation._predict */
 static void predict_to_now(const controller_state *s, double elapsed, controller_estimate *e)
 {
     const controller_estimate before = *e;
