@@ -29,7 +29,7 @@ PLAIN = {
     'copy_block', 'swap', 'rotate', 'input_to_deviation', 'input_to_physical', 'distance_between',
     'at_node', 'solve_by_doubling', 'to_discrete', 'over_interval', 'double_interval',
     'feedback_gain', 'missed', 'usable', 'earlier', 'advance_clock', 'since', 'is_far', 'ask_for'}
-LOOPS = ('heated_line', 'quadruple_tank', 'two_state_example', 6, 11, 13, 27)
+LOOPS = ('heated_line', 'quadruple_tank', 'two_state_example', 6, 11, 13, 22)
 SAMPLES = 60
 
 
