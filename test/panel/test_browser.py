@@ -14,7 +14,8 @@ import time
 import warnings
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from playwright.sync_api import expect, Locator, Page, TimeoutError as PlaywrightTimeout
+from playwright.sync_api import expect, Locator, Page
+from playwright.sync_api import TimeoutError as PlaywrightTimeout
 import pytest
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
@@ -355,7 +356,7 @@ def standing(page: Page, said: str) -> Locator:
     return page.get_by_label('Active alarms').get_by_role('listitem').filter(has_text=said)
 
 
-def press(button: Locator, acted: Callable[[], bool]) -> None:
+def press_row(button: Locator, acted: Callable[[], bool]) -> None:
     """Press a button of a row until it has acted: a row that has just moved ignores a press."""
     deadline = time.monotonic() + PATIENCE / 1e3
     while not acted():
@@ -386,17 +387,18 @@ def test_an_alarm_is_raised_shelved_shown_again_acknowledged_and_gone(site: Site
             assert page.locator('b', has_text='bold').count() == 0
             status.level = DiagnosticStatus.OK
             evil.publish(DiagnosticArray(status=[status]))
-            press(row.get_by_role('button', name='Acknowledge'), lambda: row.count() == 0)
+            press_row(row.get_by_role('button', name='Acknowledge'), lambda: row.count() == 0)
             expect(own).to_contain_text('HIGH')
             fits(page)
             expect(page.get_by_role('link', name=re.compile(r'Alarms \(\d+\)'))).to_be_visible()
             expect(own.get_by_role('button', name='Shelve 8 h')).to_be_visible()
-            press(own.get_by_role('button', name='Shelve 10 min'), lambda: own.count() == 0)
+            press_row(own.get_by_role('button', name='Shelve 10 min'), lambda: own.count() == 0)
             shelved = page.get_by_label('Shelved alarms')
             expect(shelved).to_contain_text(said)
-            press(shelved.get_by_role('button', name='Unshelve'), lambda: own.count() == 1)
-            press(own.get_by_role('button', name='Acknowledge'),
-                  lambda: 'acknowledged by anna' in own.inner_text())
+            press_row(
+                shelved.get_by_role('button', name='Unshelve'), lambda: own.count() == 1)
+            press_row(own.get_by_role('button', name='Acknowledge'),
+                      lambda: 'acknowledged by anna' in own.inner_text())
         finally:
             node.destroy_publisher(other)
             node.destroy_publisher(evil)
