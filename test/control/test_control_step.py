@@ -256,7 +256,7 @@ def test_what_the_record_measured_is_measured_and_controlled_by_default():
     # the node and the C export have the same default
     node = built(table_of(model, {'system': ''}).snapshot({}), model)
     assert (node.measured.names, node.controlled.names) == (('temperature',),) * 2
-    assert '#define KOOPMAN_NY 1' in c_code(loop, 1.0)['controller.h']
+    assert '#define CONTROLLER_NY 1' in c_code(loop, 1.0)['controller.h']
     # other outputs can be given
     every = Controller(model, Tuning.for_model(model), Controller(
         shipped('two_state'), Tuning.for_model(model)).measured)
