@@ -103,8 +103,7 @@ def resolved(text: str, used: Mapping[str, bool]) -> str:
     for line in text.splitlines(keepends=True):
         directive = re.match(r'#(if|else|endif)\b *(!?)(\w*)$', line)
         if line.startswith('#if'):
-            known = directive is not None and directive[3] in used
-            if directive is not None and known:
+            if directive is not None and directive[3] in used:
                 kept.append((used[directive[3]] != bool(directive[2]), True))
                 continue
             kept.append((True, False))

@@ -74,7 +74,7 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
     check(model)
     about, tensors = _description(model), _tensors(model)
     metadata = json.dumps({'format_version': FORMAT_VERSION, 'model': about,
-                           'sha256': digest(model)}, sort_keys=True, allow_nan=False)
+                           'sha256': _checksum(about, tensors)}, sort_keys=True, allow_nan=False)
     write_atomically(Path(path), safetensors.numpy.save(tensors, metadata={_KEY: metadata}))
 
 

@@ -121,19 +121,19 @@ class NetworkObservables(Observables):
 
     def lift(self, x: Array) -> Array:
         """Evaluate z = N(x): (..., n_x) -> (..., n_z)."""
-        free = (np.tanh(x.dot(self.W.T) + self.b) - self.value_at_zero).dot(self.V.T)
+        free = (self._hidden(x) - self.value_at_zero).dot(self.V.T)
         return np.concatenate((x, free), axis=-1) if self.identity else np.asarray(free)
 
     def lift_and_jacobian(self, x: Array) -> tuple[Array, Array]:
         """Evaluate N(x) and J_N(x); shapes as in the interface."""
-        h = np.tanh(x.dot(self.W.T) + self.b)
+        h = self._hidden(x)
         z: Array = (h - self.value_at_zero).dot(self.V.T)
         J = (1.0 - h * h).dot(self._products).reshape(*x.shape[:-1], self.n_z, self.n_x)
         return np.concatenate((x, z), axis=-1) if self.identity else z, J + self._of_states
 
     def lift_and_derivatives(self, x: Array) -> tuple[Array, Array, Array]:
         """Evaluate N(x), J_N(x) and the derivatives of J_N; shapes as in the interface."""
-        h, n = np.tanh(x.dot(self.W.T) + self.b), self.n_x
+        h, n = self._hidden(x), self.n_x
         products = (self.W[:, :, None] * self.W[:, None, :]).reshape(-1, n * n)
         bend = (self.V * (-2.0 * h * (1.0 - h * h))[..., None, :]) @ products
         states = np.zeros((*x.shape[:-1], self.n_z - len(self.V), n, n))
@@ -142,8 +142,7 @@ class NetworkObservables(Observables):
 
     def secants(self, x: Array, x_ref: Array, w: Array) -> tuple[Array, Array, Array]:
         """Evaluate the secants, by divided differences of tanh and of its slope."""
-        h, h_ref = np.tanh(x.dot(self.W.T) + self.b), np.tanh(x_ref.dot(self.W.T) + self.b)
-        apart = self.W.dot(x - x_ref)
+        h, h_ref, apart = self._hidden(x), self._hidden(x_ref), self.W.dot(x - x_ref)
         # tanh a - tanh r = tanh(a - r) (1 - tanh a tanh r); the offset makes the ratio 1 at 0
         apart += np.copysign(1e-300, apart)
         secant = np.tanh(apart) / apart * (1.0 - h * h_ref)
@@ -151,6 +150,9 @@ class NetworkObservables(Observables):
             1.0 - h * h, secant, -(h + h_ref) * secant * self.W.dot(w))
             ).dot(self._products).reshape(3, self.n_z, self.n_x)
         return J + self._of_states, M + self._of_states, H
+
+    def _hidden(self, x: Array) -> Array:
+        return np.tanh(x.dot(self.W.T) + self.b)
 
     @cached_property
     def _of_states(self) -> Array:

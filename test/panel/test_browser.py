@@ -25,7 +25,7 @@ from koopman_ros.demo import reactor
 from koopman_ros.model import load, save
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, NodeProcess
-from support.browser import ADDRESS, opened_browser, Pages, PATIENCE
+from support.browser import ADDRESS, opened_browser, Pages, PATIENCE, repeat_until
 from support.nodes import value
 from support.users import PASSWORDS, write_users
 
@@ -358,12 +358,12 @@ def standing(page: Page, said: str) -> Locator:
 
 def press_row(button: Locator, acted: Callable[[], bool]) -> None:
     """Press a button of a row until it has acted: a row that has just moved ignores a press."""
-    deadline = time.monotonic() + PATIENCE / 1e3
-    while not acted():
-        assert time.monotonic() < deadline, f'{button} does not act'
+    def act() -> None:
         with contextlib.suppress(PlaywrightTimeout):
             button.click(timeout=1000.0)
         button.page.wait_for_timeout(500.0)
+
+    repeat_until(acted, act)
 
 
 def test_an_alarm_is_raised_shelved_shown_again_acknowledged_and_gone(site: Site) -> None:

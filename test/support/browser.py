@@ -3,10 +3,11 @@
 
 """A real browser that notes what its pages complain of, and whom they ask."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 import contextlib
 import re
 import shutil
+import time
 
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 import pytest
@@ -73,6 +74,14 @@ class Pages:
     def _note(self, url: str) -> None:
         if not _OWN.match(url):
             self._foreign.append(url)
+
+
+def repeat_until(acted: Callable[[], bool], act: Callable[[], object]) -> None:
+    """Act, which may be ignored once, until it has an effect on a page."""
+    deadline = time.monotonic() + PATIENCE / 1e3
+    while not acted():
+        assert time.monotonic() < deadline
+        act()
 
 
 @contextlib.contextmanager
