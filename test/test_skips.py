@@ -3,32 +3,38 @@
 
 """Without Chromium its tests are skipped with a hint; continuous integration requires them."""
 
-import os
 from pathlib import Path
-import subprocess
-import sys
 
 import pytest
 
 from support import INSTALL_CHROMIUM
 
-FILE = 'test/panel/test_server.py'
+pytest_plugins = ['pytester']
+TESTS = """
+from support.browser import opened_browser
+def test_one():
+    with opened_browser():
+        pass
+test_another = test_one
+"""
 
 
 @pytest.mark.parametrize(('ci', 'code'), [('', 0), ('true', 1)])
 def test_tests_with_a_browser_are_skipped_without_one_but_not_in_continuous_integration(
-        tmp_path: Path, ci: str, code: int) -> None:
-    root = Path(__file__).parent.parent
-    found = subprocess.run(
-        [sys.executable, '-m', 'pytest', '-q', '-p', 'no:cacheprovider', FILE, '-k',
-         'outside_runs or narrow_window'], cwd=root, text=True, capture_output=True, check=False,
-        env={**os.environ, 'PATH': str(tmp_path), 'CI': ci})
-    assert found.returncode == code, found.stdout
+        pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, ci: str, code: int) -> None:
+    pytester.makeconftest((Path(__file__).parent / 'conftest.py').read_text())
+    pytester.makepyfile(TESTS)
+    for name, value in (('PATH', str(pytester.path)), ('CI', ci),
+                        ('PYTEST_DISABLE_PLUGIN_AUTOLOAD', '1')):
+        monkeypatch.setenv(name, value)
+    found = pytester.runpytest_inprocess('-q', '-ra')
+    assert found.ret == code
+    text = found.stdout.str()
+    assert INSTALL_CHROMIUM in text
     if ci:
-        assert 'CI=true requires every test' in found.stdout
-        assert INSTALL_CHROMIUM in found.stdout
+        assert 'CI=true requires every test' in text
     else:
-        *_, hint, last = found.stdout.strip().splitlines()
+        *_, hint, last = text.strip().splitlines()
         assert INSTALL_CHROMIUM in hint
         assert hint.startswith('2 tests')
         assert '2 skipped' in last

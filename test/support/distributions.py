@@ -37,13 +37,17 @@ def installed_with(*wanted: str) -> set[str]:
         name = canonicalize_name(requirement.name)
         new = {(name, extra) for extra in ('', *requirement.extras)} - found
         found |= new
-        try:
-            needs = map(Requirement, distribution(name).requires or ())
-        except PackageNotFoundError:
-            continue
-        left += [one for one in needs if any(
+        left += [one for one in _requirements(name) if any(
             one.marker is None or one.marker.evaluate({'extra': extra}) for _, extra in new)]
     return {name for name, _ in found}
+
+
+@cache
+def _requirements(name: str) -> list[Requirement]:
+    try:
+        return [*map(Requirement, distribution(name).requires or ())]
+    except PackageNotFoundError:
+        return []
 
 
 def modules_without(distributions: Iterable[str]) -> set[str]:
@@ -134,6 +138,7 @@ def _names(node: ast.Import | ast.ImportFrom, path: Path) -> list[str]:
                            if _files(node.module) and _is_file(f'{node.module}.{alias.name}'))]
 
 
+@cache
 def _is_file(module: str) -> bool:
     place = ROOT.joinpath(*module.split('.'))
     return place.with_suffix('.py').is_file() or (place / '__init__.py').is_file()
