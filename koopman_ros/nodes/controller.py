@@ -51,7 +51,8 @@ from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.measurements import Measurements, Sample
 from koopman_ros.ros.model_reload import ModelReload
 from koopman_ros.ros.operator_requests import OperatorRequests
-from koopman_ros.ros.process import events_executor, run
+from koopman_ros.ros.process import run
+from koopman_ros.ros.rclpy_internals import events_executor
 from koopman_ros.ros.signals import SignalPublisher
 from koopman_ros.ros.time_conversion import stamp_message
 from koopman_ros.ros.timing import Timing

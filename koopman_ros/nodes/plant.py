@@ -30,7 +30,8 @@ from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.host import run_loops
 from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.process import events_executor, run
+from koopman_ros.ros.process import run
+from koopman_ros.ros.rclpy_internals import events_executor
 from koopman_ros.ros.signals import SignalPublisher, SignalSample, SignalSubscriber
 from koopman_ros.ros.simulated_plant import Analyser, SimulatedPlant
 from koopman_ros.ros.time_conversion import stamp_message

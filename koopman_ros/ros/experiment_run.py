@@ -38,6 +38,7 @@ from koopman_ros.parameters.trainer import COMMAND, MANUAL, SETPOINT, TrainerPar
 from koopman_ros.ros import topics
 from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.managed import ManagedNode
+from koopman_ros.ros.rclpy_internals import take_message
 from koopman_ros.ros.signals import (
     InputWait,
     MeasuredInputs,
@@ -98,7 +99,7 @@ class ExperimentRun:
         self._sent: Array | None = None
         self._monitors = [TrackingMonitor(span)
                           for span in (self.plan.upper - self.plan.lower).tolist()]
-        self._subscriptions: list[Subscription] = []
+        self._endpoints = topics.EndpointMonitor(node, lambda: None)
         self._assembler = synchroniser(
             wiring.measured, signals.states, settings.synchronisation_tolerance)
         self._measured = SignalSubscriber(
@@ -113,28 +114,23 @@ class ExperimentRun:
                              signals.states,
                              lambda received: self._tracked.update(received.values))
             self._subscribe(topics.EVENT_LOG, self._on_record, String)
-        self._publisher = SignalPublisher(places, self._units, lambda topic, kind: (
-            node.create_publisher(kind, topic, topics.LOOP_QOS)))
+        self._publisher = SignalPublisher(places, self._units, self._endpoints.publish)
         self._timer = wall_timer(node, _TICK, self._on_tick)
 
     def destroy(self) -> None:
         """Command no more."""
         self._wait.clear()
         self._node.destroy_timer(self._timer)
-        for publisher in self._publisher.publishers:
-            self._node.destroy_publisher(publisher)
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
+        self._endpoints.destroy()
 
     def _subscribe(self, topic: str, callback: Callable[[Any], None], kind: Any,
                    latched: bool = False) -> Subscription:
-        # a sensor driver may publish best effort
+        # now, as the first message counts; the monitor follows publishers that start later
         publishers = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
         qos = topics.matching_profile(topics.LOOP_QOS, publishers, topics.LOOP_QOS.depth)
         if latched:
             qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
-        self._subscriptions.append(self._node.create_subscription(kind, topic, callback, qos))
-        return self._subscriptions[-1]
+        return self._endpoints.subscribe(topic, callback, kind, qos)
 
     @property
     def topics(self) -> str:
@@ -229,12 +225,12 @@ class ExperimentRun:
     def _waiting_stamps(self) -> list[int]:
         """Take one measurement from each topic without the executor; return their stamps."""
         found = []
-        for subscription in self._measured.subscriptions:
-            with (handle := subscription.handle):
-                if taken := handle.take_message(subscription.msg_type, False):
-                    header = getattr(taken[0], 'header', None)
-                    found.append(self._node.get_clock().now().nanoseconds if (
-                        header is None) else stamp_nanoseconds(header.stamp))
+        for subscription in self._endpoints.subscriptions:
+            if subscription.topic_name in self._measured.topics and (
+                    taken := take_message(subscription)):
+                header = getattr(taken[0], 'header', None)
+                found.append(self._node.get_clock().now().nanoseconds if (
+                    header is None) else stamp_nanoseconds(header.stamp))
         return found
 
     def _on_measurement(self, received: SignalSample) -> None:

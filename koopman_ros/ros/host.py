@@ -24,7 +24,6 @@ from koopman_ros.ros.hosted import HostContext, HostedNode, wall_timer
 from koopman_ros.ros.managed import ManagedNode, one_line, START_ERRORS
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import (
-    events_executor,
     init,
     LONGEST_WAIT,
     PROFILES,
@@ -32,6 +31,7 @@ from koopman_ros.ros.process import (
     take_down,
     TAKE_DOWN_PATIENCE,
 )
+from koopman_ros.ros.rclpy_internals import events_executor
 from koopman_ros.ros.watchdog import end_in_time
 
 _PERIOD = 0.1  # s between two looks at nodes that have ended

@@ -19,6 +19,7 @@ from rosgraph_msgs.msg import Clock
 from koopman_ros.core.plugins import contained
 from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.node import LoopNode
+from koopman_ros.ros.rclpy_internals import end_lifecycle, take_request
 
 # A parameter or a model that does not fit is a ValueError; rclpy raises RCLError for an unreadable
 # parameter file, a RuntimeError whose class is private to the extension.
@@ -47,14 +48,15 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         # reports in each state
         assert self.diagnostics
         self._kept = self._entities()
-        change = self._service_change_state.callback
-        self._service_change_state.callback = lambda request, response: self._on_change(
+        (transitions,) = (one for one in self.services if one.srv_type is ChangeState)
+        change = transitions.callback
+        transitions.callback = lambda request, response: self._on_change(
             change, request, response)
 
     def destroy_node(self) -> None:
         """Take the node down with its lifecycle, which would keep its name on the network."""
         super().destroy_node()
-        self._state_machine.destroy_when_not_in_use()
+        end_lifecycle(self)
 
     def start(self) -> None:
         """Configure and activate, as without a manager; raises the error."""
@@ -171,16 +173,13 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         for service in self.services:
             if any(service is kept for kept in self._kept[1]):
                 continue
-            with service.handle:
-                kind: Any = service.srv_type
-                while (taken := service.handle.service_take_request(
-                        kind.Request))[1] is not None:
-                    response = kind.Response()
-                    if hasattr(response, 'message'):
-                        response.message = (
-                            f'{self.get_name()} is not configured: configure and activate it '
-                            'first')
-                    service.send_response(response, taken[1])
+            kind: Any = service.srv_type
+            while (header := take_request(service)) is not None:
+                response = kind.Response()
+                if hasattr(response, 'message'):
+                    response.message = (
+                        f'{self.get_name()} is not configured: configure and activate it first')
+                service.send_response(response, header)
 
     def _entities(self) -> tuple[list[Any], ...]:
         # rclpy subscribes to the time whenever `use_sim_time` is set

@@ -6,10 +6,10 @@
 from collections import Counter
 from collections.abc import Mapping
 
-from rclpy.event_handler import QoSSubscriptionEventType, UnsupportedEventTypeError
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.subscription import Subscription
+
+from koopman_ros.ros.rclpy_internals import LostMessages
 
 
 class MissedMessages:
@@ -24,7 +24,7 @@ class MissedMessages:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._events: dict[str, rclpy_implementation.EventHandle] = {}
+        self._events: dict[str, LostMessages] = {}
         self._lost: Counter[str] = Counter()  # by the events
         self._skipped: Counter[str] = Counter()  # by the numbers
         self._last_number: dict[str, int] = {}
@@ -37,25 +37,18 @@ class MissedMessages:
 
     def watch(self, subscription: Subscription) -> None:
         """Count the events of a subscription, until :meth:`end`."""
-        try:
-            self._events[subscription.topic_name] = rclpy_implementation.EventHandle(
-                subscription.handle, QoSSubscriptionEventType.RCL_SUBSCRIPTION_MESSAGE_LOST)
-        except UnsupportedEventTypeError:
-            return
+        self._events[subscription.topic_name] = LostMessages(subscription)
 
     def end(self, subscription: Subscription) -> None:
         """Read the last events of a subscription, before it is destroyed."""
         self.look_for_events()
         if event := self._events.pop(subscription.topic_name, None):
-            event.destroy_when_not_in_use()
+            event.end()
 
     def look_for_events(self) -> None:
         """Count the messages that were lost since the last call."""
         for topic, event in self._events.items():
-            with event:
-                status = event.take_event()
-            if status is not None and status.total_count_change > 0:
-                self._lost[topic] += status.total_count_change
+            self._lost[topic] += event.take()
 
     def on_message(self, topic: str, info: Mapping[str, int | None]) -> None:
         """Count the messages between the last one and this one by their sequence numbers."""

@@ -81,20 +81,6 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
     return node.exit_code or 0
 
 
-def events_executor() -> Executor:
-    """
-    Return an executor that is notified of each message, for nodes without clients.
-
-    rclpy's other executors rebuild their wait set for each message, which takes longer than a
-    control step. The first releases for Jazzy have no other.
-    """
-    try:
-        from rclpy.experimental import EventsExecutor
-    except ImportError:
-        return SingleThreadedExecutor()
-    return EventsExecutor()
-
-
 def run_task(name: str, prepare: Callable[[], Callable[[], int]],
              args: list[str] | None = None) -> int:
     """

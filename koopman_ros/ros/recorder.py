@@ -28,6 +28,7 @@ from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.records import BagWriter, message_definition
 from koopman_ros.ros import topics
 from koopman_ros.ros.missed_messages import MissedMessages
+from koopman_ros.ros.rclpy_internals import take_message
 from koopman_ros.ros.time_conversion import stamp_nanoseconds
 
 # An unlimited duration [ns]: RMW_DURATION_INFINITE.
@@ -186,20 +187,19 @@ class Recorder:
 
     def _waiting(self, topic: str, subscription: Subscription) -> list[_Taken]:
         waiting: list[_Taken] = []
-        with (handle := subscription.handle):
-            # no more than can wait, lest a fast publisher keeps us here
-            while len(waiting) < QUEUE_DEPTH:
-                now_ns = time.time_ns()
-                taken = take_raw(handle, subscription.msg_type)
-                if taken is None:
-                    self._empty_ns[topic] = now_ns
-                    break
-                data, info = taken
-                if subscription is not self._clock:
-                    self._missed.on_message(topic, info)
-                received_ns = receipt_ns(info, now_ns, self._empty_ns[topic], self._at_take)
-                waiting.append(_Taken(
-                    topic, data, received_ns, info['source_timestamp'] or received_ns))
+        # no more than can wait, lest a fast publisher keeps us here
+        while len(waiting) < QUEUE_DEPTH:
+            now_ns = time.time_ns()
+            taken = take_message(subscription, raw=True)
+            if taken is None:
+                self._empty_ns[topic] = now_ns
+                break
+            data, info = taken
+            if subscription is not self._clock:
+                self._missed.on_message(topic, info)
+            received_ns = receipt_ns(info, now_ns, self._empty_ns[topic], self._at_take)
+            waiting.append(_Taken(
+                topic, data, received_ns, info['source_timestamp'] or received_ns))
         return waiting
 
     def _record_in_order(self, subscriptions: Mapping[str, Subscription]) -> None:
@@ -232,11 +232,6 @@ class Recorder:
         now = deserialize_message(data, Clock).clock
         if now.sec >= 0 and now.nanosec < NANOSECONDS:
             self._now_ns = stamp_nanoseconds(now)
-
-
-def take_raw(handle: Any, message_type: Any) -> tuple[bytes, Mapping[str, int]] | None:
-    """Take one serialized message with its times from the middleware, None when none waits."""
-    return handle.take_message(message_type, True)
 
 
 def receipt_ns(info: Mapping[str, int], take_ns: int, empty_ns: int, at_take: bool) -> int:

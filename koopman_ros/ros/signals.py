@@ -125,7 +125,6 @@ class SignalSubscriber:
                  places: Mapping[str, MessageField], units: Mapping[str, str],
                  callback: Callable[[SignalSample], None]) -> None:
         self._node, self._callback = node, callback
-        self.subscriptions: list[Subscription] = []  #: as they were made
         self.topics: list[str] = []  #: with their namespace
         self.unstamped: list[str] = []  #: topics whose messages are stamped at their arrival
         for topic, kind, names in by_topic(places):
@@ -133,8 +132,7 @@ class SignalSubscriber:
                    for name in names}
             if not hasattr(kind, 'header'):
                 self.unstamped.append(topic)
-            self.subscriptions.append(subscribe(topic, _with_info(
-                partial(self._take, topic, own)), kind))
+            subscribe(topic, _with_info(partial(self._take, topic, own)), kind)
             self.topics.append(node.resolve_topic_name(topic))
 
     def _take(self, topic: str, own: Mapping[str, Any], message: Any, info: Mapping[str, Any]

@@ -137,7 +137,20 @@ class EndpointMonitor:
         self._shared: dict[str, bool] = {}
         self._next_look = 0.0  # by the steady clock
         self._loops = 1 if node.hosting is None else node.hosting.loops
-        wall_timer(node, _LOOK_PERIOD, self._look_in_turn)
+        self._timer = wall_timer(node, _LOOK_PERIOD, self._look_in_turn)
+
+    def destroy(self) -> None:
+        """Destroy the publishers and subscriptions, and look no more."""
+        self._node.destroy_timer(self._timer)
+        for publisher in self._publishers:
+            self._node.destroy_publisher(publisher)
+        for subscription in self.subscriptions:
+            self._node.destroy_subscription(subscription)
+
+    @property
+    def subscriptions(self) -> list[Subscription]:
+        """Those at present: another one replaces one whose publishers are less reliable."""
+        return [own for own, _ in self._subscriptions]
 
     @property
     def complaint(self) -> str:
@@ -195,7 +208,7 @@ class EndpointMonitor:
 
     @property
     def _own(self) -> list[Publisher | Subscription]:
-        return [*self._publishers, *(own for own, _ in self._subscriptions)]
+        return [*self._publishers, *self.subscriptions]
 
     def _adapted(self, own: Subscription, make: Callable[[QoSProfile], Subscription] | None
                  ) -> Subscription:

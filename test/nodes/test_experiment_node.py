@@ -11,6 +11,8 @@ import signal
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 import pytest
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Temperature
 
@@ -46,11 +48,15 @@ class Bench:
         self.ros = ros
         self.commands = ros.listen(Temperature, JACKET)
         ros.start('trainer', IDLE, ('-r', '__ns:=/unit_1', '-r', 'coolant_setpoint:=jacket'))
-        self.thermometer = ros.node.create_publisher(
-            Temperature, '/unit_1/temperature',
-            QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
+        self.thermometer = self.publisher(ReliabilityPolicy.BEST_EFFORT)
         self.time = 0.0
         ros.meet(TRAINER)
+
+    def publisher(self, reliability: ReliabilityPolicy) -> Publisher:
+        # rclpy raises where a publisher is destroyed while one of its events is waiting
+        return self.ros.node.create_publisher(
+            Temperature, '/unit_1/temperature', QoSProfile(depth=10, reliability=reliability),
+            event_callbacks=PublisherEventCallbacks(use_default_callbacks=False))
 
     def ask(self, begin: bool) -> tuple[bool, str]:
         response = self.ros.set_bool(f'unit_1/{SERVICE}', begin)
@@ -181,6 +187,26 @@ def test_silent_sensor_brings_the_safe_coolant(shared_bench: Bench) -> None:
     ros.wait_until(lambda: len(bench.commands) > heard + 2)
     # a sensor that comes back is answered, with the same
     assert bench.answer() == pytest.approx(SAFE, abs=1e-9)
+    assert bench.ask(False)[1] == LOST
+
+
+def test_thermometer_of_another_reliability_takes_over(ros: Harness) -> None:
+    """The subscription follows the publishers during an experiment, too."""
+    bench = Bench(ros)
+    bench.set(experiment_timeout=30.0)
+
+    def replace(reliability: ReliabilityPolicy) -> None:
+        ros.node.destroy_publisher(bench.thermometer)
+        bench.thermometer = bench.publisher(reliability)
+
+    replace(ReliabilityPolicy.RELIABLE)
+    assert bench.start()[0]
+    replace(ReliabilityPolicy.BEST_EFFORT)
+    before = len(bench.commands)
+    timer = ros.node.create_timer(0.05, bench.measure)
+    ros.wait_until(lambda: len(bench.commands) > before + 3)
+    ros.node.destroy_timer(timer)
+    assert bench.ask(False)[0]
     assert bench.ask(False)[1] == LOST
 
 

@@ -6,9 +6,9 @@
 from collections.abc import Iterator
 from typing import Any
 
+from lifecycle_msgs.srv import GetState
 import pytest
 from rclpy.context import Context
-from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
@@ -17,6 +17,7 @@ from std_srvs.srv import Trigger
 from koopman_ros.ros.diagnostics import Severity, TaskReport
 from koopman_ros.ros.hosted import HostContext, wall_timer
 from koopman_ros.ros.managed import ManagedNode
+from koopman_ros.ros.rclpy_internals import events_executor
 from koopman_ros.testing import Harness
 
 
@@ -54,7 +55,8 @@ def node(shared_ros: Harness) -> Iterator[Failing]:
 
 
 def state(node: ManagedNode) -> str:
-    return str(node._state_machine.current_state[1])
+    (service,) = (one for one in node.services if one.srv_type is GetState)
+    return str(service.callback(GetState.Request(), GetState.Response()).current_state.label)
 
 
 def parts(node: Failing) -> tuple[set[Any], ...]:
@@ -144,7 +146,7 @@ def test_pending_callbacks_are_rejected_or_dropped_at_shutdown(shared_ros: Harne
             speaker.publish(String())
     assert all(speaker.wait_for_all_acked() for speaker in speakers)
     asked = [client.call_async(Trigger.Request()) for _ in range(3)]
-    executor = EventsExecutor(context=ros.node.context)
+    executor = events_executor(ros.node.context)
     executor.add_node(node)
     # what has come is queued, and one of it handled
     ros.wait_until(lambda: executor.spin_once(timeout_sec=0.01) or heard)

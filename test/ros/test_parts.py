@@ -18,6 +18,7 @@ import pytest
 from rclpy.duration import Duration
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
 from rclpy.task import Future
 from rclpy.utilities import get_rmw_implementation_identifier
 from sensor_msgs.msg import Temperature
@@ -40,6 +41,7 @@ from koopman_ros.ros.controller_status import Counts, statuses
 from koopman_ros.ros.diagnostics import Severity
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.missed_messages import MissedMessages
+from koopman_ros.ros.rclpy_internals import take_message
 from koopman_ros.ros.recorder import receipt_ns, Recorder
 from koopman_ros.ros.remote_node import repeated
 from koopman_ros.ros.signals import MeasuredInputs, SignalSample
@@ -77,9 +79,9 @@ def test_clean_up_removes_everything_that_a_node_created(
     node.destroy_node()
 
 
-def stamped_at_the_take(handle: Any, message_type: type) -> Any:
+def stamped_at_the_take(subscription: Subscription, raw: bool) -> Any:
     """Take a message as rmw_cyclonedds does, which says that it was received just now."""
-    taken = handle.take_message(message_type, True)
+    taken = take_message(subscription, raw)
     return taken and (taken[0], {**taken[1], 'received_timestamp': time.time_ns()})
 
 
@@ -88,7 +90,7 @@ def test_batch_is_recorded_in_the_order_of_sending(
         ros: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_the_take: bool
         ) -> None:
     if at_the_take:
-        monkeypatch.setattr(recorder, 'take_raw', stamped_at_the_take)
+        monkeypatch.setattr(recorder, 'take_message', stamped_at_the_take)
         monkeypatch.setattr(recorder, '_STAMPED_AT_TAKE', (get_rmw_implementation_identifier(),))
     publishers = [ros.node.create_publisher(Temperature, name, topics.LOOP_QOS) for name in NAMES]
     recording = Recorder(ros.node, BagWriter(tmp_path / 'run.mcap'), NAMES,
