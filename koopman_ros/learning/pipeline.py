@@ -54,7 +54,6 @@ DRIFT, LINEAR_MODEL = 'estimated drift', 'best linear model'  #: compared with t
 _LESS_FIT = 1.0
 
 
-
 def retrain(task: TrainingTask, on_progress: OnProgress | None = None, *,
             record: Record | None = None, test: Record | None = None) -> Retrained:
     """

@@ -62,6 +62,7 @@ def trend_page(page: PageLayout) -> None:
 
     for control in (span, whole, until):
         control.on_value_change(change)
+
     def follow() -> None:
         until.set_value('')
         chart.reset()

@@ -29,7 +29,6 @@ def parsed_number(text: str) -> float:
         raise ValueError(f'{text!r} is not a number') from None
 
 
-
 @dataclass(frozen=True)
 class ParameterDescription:
     """

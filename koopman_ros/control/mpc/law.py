@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 _PACKAGE = 'daqp'
 
+
 @dataclass(frozen=True)
 class MPCParameters:
     """Soft limits of the states, and the time limit of a plan."""
@@ -69,11 +70,11 @@ class RecedingHorizon(Law):
         self.planner: Planner | None = None
         self._unusable: Reason | None = None
         try:
-            from koopman_ros.control.mpc.planner import Planner
+            from koopman_ros.control.mpc import planner
         except ImportError:
             self._unusable = reason(StatusCode.PACKAGE_MISSING, package=_PACKAGE)
             return
-        self.planner = Planner(model, tuning, self.weights, self.settings, *(
+        self.planner = planner.Planner(model, tuning, self.weights, self.settings, *(
             np.broadcast_to(bound, model.n_x) for bound in (parameters.lower, parameters.upper)))
 
     def unusable(self) -> Reason | None:
