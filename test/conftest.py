@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import gc
 import os
 import signal
+import sys
 
 import pytest
 
@@ -21,7 +22,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 from koopman_ros.process_entry import SIGNALS
-from support import INSTALL_CHROMIUM
+from support import forked, INSTALL_CHROMIUM
 from support.disturbance import disturb_training
 
 # An int in a float64 field, say, passes unnoticed here, and aborts the process where the message
@@ -46,9 +47,15 @@ LONGEST = ('test_browser', 'test_demo', 'test_unmeasured_states', 'test_training
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_collection() -> Iterator[None]:
-    """Exclude all that the test modules hold from garbage collections: 0.3 s for each."""
+    """
+    Exclude all that the test modules hold from garbage collections: 0.3 s for each.
+
+    Nodes are forked where a test module starts some.
+    """
     gc.disable()
     yield
+    if testing := sys.modules.get('koopman_ros.testing'):
+        testing.NodeProcess.popen = staticmethod(forked.start)
     gc.collect()
     gc.freeze()
     gc.enable()

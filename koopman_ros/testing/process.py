@@ -14,6 +14,7 @@ import signal
 import socket
 import subprocess
 from types import TracebackType
+from typing import ClassVar
 
 from koopman_ros import process_entry
 from koopman_ros.core.paths import config_directory, LOOPBACK_PROFILE
@@ -36,7 +37,10 @@ class NodeProcess:
     :param arguments: further ROS arguments, e.g. ``('-r', '__ns:=/unit_1')``.
     :param command: command to run instead of a node of this package.
     :ivar told_to_end: whether its end is expected, e.g. after :meth:`stop`.
+    :cvar popen: starts the processes, called as `subprocess.Popen`; returns the same interface.
     """
+
+    popen: ClassVar[Callable[..., subprocess.Popen[bytes]]] = subprocess.Popen
 
     def __init__(self, name: str, parameters: Mapping[str, object], log: Path,
                  environment: Mapping[str, str], arguments: tuple[str, ...] = (),
@@ -51,7 +55,7 @@ class NodeProcess:
         waiting = contextlib.nullcontext() if command else process_entry.blocked_signals()
         with open(log, 'wb') as output, waiting:
             # a session of its own: an interrupt of the terminal is passed on by us, in order
-            self.process = subprocess.Popen(
+            self.process = self.popen(
                 [*program, *(('--ros-args', *given, *arguments) if given or arguments else ())],
                 stdout=output, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
                 start_new_session=True,
