@@ -35,6 +35,7 @@ from std_msgs.msg import String
 from koopman_ros.demo import reactor
 from koopman_ros.nodes import panel
 from koopman_ros.nodes.panel import PanelNode
+from koopman_ros.panel import requests
 from koopman_ros.panel.requests import Action, Answer
 from koopman_ros.panel.snapshot import CONTROLLER, TRAINER
 from koopman_ros.ros import remote_node, topics
@@ -196,6 +197,8 @@ class Panel:
                 pass
 
         monkeypatch.setattr(PanelNode, '_serve', lambda _: Nothing())
+        # on a busy machine
+        monkeypatch.setattr(requests, 'TIMEOUT', TIMEOUT)
         # of the two one in the usual unit
         rclpy.init(args=['--ros-args', '-p', 'coolant_temperature.shown_unit:=degF'])
         self.ros, self.node = ros, PanelNode()
