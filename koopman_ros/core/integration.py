@@ -96,8 +96,8 @@ def integrate(rate: Callable[[Array], Array], x: Array, duration: Array | float,
     return x
 
 
-def sensitivity_rate(rate_and_jacobian: Callable[[Array], tuple[Array, Array]], forcing: Array
-                     ) -> Callable[[Array], Array]:
+def sensitivity_rate(rate_and_jacobian: Callable[[Array], tuple[Array, Array]],
+                     forcing: Array | Callable[[Array], Array]) -> Callable[[Array], Array]:
     """
     Return the rate of a state together with its sensitivities to p parameters.
 
@@ -105,12 +105,13 @@ def sensitivity_rate(rate_and_jacobian: Callable[[Array], tuple[Array, Array]], 
     Systems* (2002), section 3.3).
 
     :param rate_and_jacobian: f (..., n) and J (..., n, n) of x (..., n).
-    :param forcing: (..., n, p) df/dp.
+    :param forcing: (..., n, p) df/dp, or a function of x.
     :return: a function of y (..., n, 1 + p).
     """
     def rate(y: Array) -> Array:
         f, J = rate_and_jacobian(y[..., 0])
-        return np.concatenate((f[..., None], J @ y[..., 1:] + forcing), axis=-1)
+        df_dp = forcing(y[..., 0]) if callable(forcing) else forcing
+        return np.concatenate((f[..., None], J @ y[..., 1:] + df_dp), axis=-1)
 
     return rate
 

@@ -20,7 +20,6 @@ class ClosedLoopSettings:
     #: and fails if its cost exceeds that with a perfect model by more than this factor
     most_excess: float = 1.05
     most_failures: float = 0.01  #: share of the closed loops that may fail
-    confidence: float = 0.99  #: of a statement about the starts that were not drawn
     attempts: int = 4  #: steady states that are sought for each set-point
     apart: float = 0.25  #: least distance of a start from its set-point
     #: share of the steady states that are set-points although none is where the data are

@@ -152,28 +152,6 @@ class ClosedLoopTest:
         return f'<ClosedLoopTest: {self}>'
 
 
-def statement(checks: Sequence[ClosedLoopTest], models: int = 1,
-              confidence: float = SETTINGS.confidence) -> str:
-    """
-    Return a bound of the share of all starts that may fail, in words; '' without loops.
-
-    The bound is that of Clopper and Pearson (1934), for the mean over the checks.
-
-    :param models: number of the plants on which the loops ran.
-    """
-    # in here: no node needs it
-    from scipy.special import betaincinv
-
-    loops, failed = (sum(map(int, counts)) for counts in (
-        [one.loops for one in checks], [one.failed.sum() for one in checks]))
-    if not loops:
-        return ''
-    most = betaincinv(failed + 1, loops - failed, confidence) if failed < loops else 1.0
-    where = f' on {models} models that explain the record equally well' if models > 1 else ''
-    return (f'{failed} of {loops} loops failed{where}: with {100.0 * confidence:g} % confidence '
-            f'at most {float(f"{100.0 * most:.2g}"):g} % of such starts fail')
-
-
 @dataclass(frozen=True)
 class _Undisturbed:
     """A rate of states and manipulated inputs, the measured disturbances at nominal values."""

@@ -130,7 +130,8 @@ def outcome_text(summary: Mapping[str, Any]) -> str:
         reasons = '; '.join(summary['reasons'])
         kept = f'; saved as {summary["model_file"]}' if summary['model_file'] else ''
         return f'the new model ({summary["model_class"]}) is rejected: {reasons}{kept}'
-    present = summary['heldout_error_of_current_model']
+    present, statement = (summary.get(key) for key in (
+        'heldout_error_of_current_model', 'closed_loop_statement'))
     other, name = (('heldout_error_of_linear_model', 'best linear model') if present is None else (
         'heldout_error_of_current_model', 'current model'))
     units = summary['units']
@@ -138,7 +139,8 @@ def outcome_text(summary: Mapping[str, Any]) -> str:
             f'{_errors(summary["heldout_error"], units)}, that of the {name} '
             + ('infinite (diverges)' if None in summary[other].values()
                else _errors(summary[other], units))
-            + f'; written to {summary["model_file"]}')
+            + f'; written to {summary["model_file"]}'
+            + (f'. {statement}' if statement else ''))
 
 
 def _errors(errors: Mapping[str, float | None], units: Mapping[str, str]) -> str:

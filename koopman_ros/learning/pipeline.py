@@ -246,7 +246,8 @@ def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
         progress('decide', JUDGED, 'judging')
         if learned is not None:
             decision = evaluate_model(found, learned, bare.present, thresholds,
-                                      watch=progress.judging_further, backend=backend)
+                                      watch=progress.judging_further, backend=backend,
+                                      setpoints=task.setpoints)
             decision = replace(decision, warnings=(*decision.warnings, *warnings))
             reasons = decision.reasons
         if not reasons:

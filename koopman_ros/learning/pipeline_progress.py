@@ -52,7 +52,7 @@ class PipelineProgress:
         return False
 
     def judging_further(self, share: float) -> bool:
-        """Report the closed loops with alternative models."""
+        """Report the closed loops on plausible plants."""
         self('decide', JUDGED + share * (WRITING - JUDGED), 'judging: further closed loops')
         return False
 

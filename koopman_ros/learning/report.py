@@ -12,6 +12,7 @@ import numpy as np
 from koopman_ros.core.plots import bullets, drawing, table, write_figures, write_page
 from koopman_ros.core.units import SECONDS_PER_TIME_UNIT, shown, unit_label
 from koopman_ros.evaluation.closed_loop_plots import draw_loops
+from koopman_ros.learning.acceptance import PlantAcceptance
 from koopman_ros.learning.downsampling import CELLS, visited_cells
 from koopman_ros.learning.identification import fitted_starts, Identified, longest_step, Segments
 from koopman_ros.learning.identification.drift import Rate
@@ -151,8 +152,25 @@ def _sections(retrained: Retrained) -> Iterator[str]:
         (own.text(point.x, '.4g'), ', '.join(f'{value:.3g}' for value in np.real_if_close(
             point.eigenvalues)))
         for point in decision.operating_points))
-    if decision.statement:
-        yield f'Simulated closed loops, started in the training range: {decision.statement}.'
+    if decision.plant is not None:
+        yield from _plant_sections(decision.plant, own)
+
+
+def _plant_sections(about: PlantAcceptance, states: Coordinates) -> Iterator[str]:
+    yield '## The plant'
+    yield f'{about.statement}.'
+    yield ('Not covered: unmeasured disturbances, and conditions that the record does not have.')
+    held = about.held
+    yield table(('state', 'recorded range that can be held [%]',
+                 'steady states that can be held [%]', 'requested set-points [%]'),
+                ((name, f'{100.0 * share:.0f}', *(f'{100.0 * one[i]:.0f}' if len(one) else ''
+                                                  for one in (held.steady,)),
+                  f'{100.0 * held.requested[name]:.0f}' if name in held.requested else '')
+                 for i, (name, share) in enumerate(zip(held.names, held.recorded, strict=True))),
+                (1, 2, 3))
+    yield 'Corrections of the drift that the record demands, as shares of the motion:'
+    yield bullets(f'{name.replace("_", " ")}: {100.0 * share:.2g} %'
+                  for name, share in about.causes.items())
 
 
 def _label(signals: Coordinates, k: int) -> str:

@@ -14,7 +14,7 @@ from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.plots import finite
 from koopman_ros.core.units import SECONDS_PER_TIME_UNIT
-from koopman_ros.learning.acceptance import AcceptanceResult
+from koopman_ros.learning.acceptance import AcceptanceResult, PlantAcceptance
 from koopman_ros.learning.free_run import FreeRun
 from koopman_ros.learning.identification import DriftModel, Identified, LaggedDrift
 from koopman_ros.learning.model_selection import ClassComparison, ModelCandidate
@@ -22,6 +22,18 @@ from koopman_ros.learning.record import Reduction
 from koopman_ros.learning.task import TrainingTask
 from koopman_ros.model import COMMANDED, LiftedModel
 from koopman_ros.records import ImportReport
+
+
+def _of_plant(about: PlantAcceptance) -> dict[str, object]:
+    """Return the figures of the closed loops on plausible plants."""
+    test, held = about.test, about.held
+    return {
+        'plausible_plants': len(test.loops), 'plausible_loops': int(np.sum(test.loops)),
+        'plausible_loops_failed': int(np.sum(test.failed)),
+        'failing_share_at_most': test.share[1],
+        'range_held': dict(zip(held.names, map(float, held.recorded), strict=True)),
+        'setpoints_held': {name: float(share) for name, share in held.requested.items()},
+        'corrections': dict(about.causes)}
 
 
 @dataclass(frozen=True)
@@ -142,11 +154,14 @@ class Retrained:
                 'heldout_error_of_current_model': None if self.decision.current_rmse is None else (
                     by_state(self.decision.current_rmse)),
                 'heldout_error_of_linear_model': by_state(self.decision.linear_rmse),
+                **({} if self.decision.plant is None else {
+                    'rate_error': by_state(self.decision.plant.band.error)}),
                 'heldout_rw': fit.rw,
                 'heldout_rx': fit.rx,
                 'condition': fit.cond,
                 'closed_loops': check.loops,
                 'closed_loop_statement': self.decision.statement,
+                **({} if self.decision.plant is None else _of_plant(self.decision.plant)),
                 'closed_loops_arrived': check.arrived,
                 'closed_loops_failed': int(np.sum(check.failed)),
                 'closed_loop_cost_over_linear': check.median_ratio,

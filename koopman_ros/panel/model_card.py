@@ -23,6 +23,7 @@ _TRAINING = {'step': 'Step', 'model_class': 'Model class',
              'heldout_error': 'Held-out error',
              'heldout_error_of_current_model': 'Held-out error of the current model',
              'heldout_error_of_linear_model': 'Held-out error of a linear model',
+             'closed_loop_statement': 'Closed loops',
              'closed_loops': 'Simulated closed loops', 'closed_loops_failed': 'of these failed',
              'closed_loop_cost_over_linear': 'Closed-loop cost relative to linear control'}
 _LAWS = {'re-centred': 'linear around the set-point',
@@ -45,6 +46,7 @@ def model_card(model: LiftedModel) -> dict[str, str]:
     found = {
         'Model class': model.kind,
         'Acceptance': origin.acceptance,
+        'Closed loops': origin.closed_loops,
         'Learned from': origin.plant, 'Derivatives': origin.method,
         'Written by': f'koopman_ros {origin.package_version}' if origin.package_version else '',
         'Random seed': '' if origin.seed is None else str(origin.seed)}

@@ -15,6 +15,7 @@ from koopman_ros.learning import (
     drift_estimation,
     evaluate_model,
     pipeline,
+    Thresholds,
 )
 from koopman_ros.learning.identification import identify_measured, structure_search
 from koopman_ros.learning.report import _sections
@@ -37,6 +38,8 @@ def quick_retraining(loops: int, degrees: tuple[int, ...] = (1, 3),
                 patch.setattr(module, original.__name__, quick)
         patch.setattr(pipeline, 'compare_classes', partial(compare_classes, loops=loops))
         patch.setattr(pipeline, 'evaluate_model', partial(evaluate_model, loops=loops))
+        patch.setattr(pipeline, 'Thresholds', partial(
+            Thresholds, plants=3, plant_loops=2, most_failing=0.5))
         yield
 
 
