@@ -17,7 +17,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help learn demo demo-retrain demo-saddle walkthrough test test-machines lint models studies studies-sensors studies-robustness studies-late studies-general studies-unstable studies-saddle studies-partial studies-records studies-export bench faults docs panel-pictures config lock clean
+.PHONY: help learn demo demo-retrain demo-saddle walkthrough test test-machines lint models studies studies-sensors studies-robustness studies-late studies-acceptance studies-general studies-unstable studies-saddle studies-partial studies-records studies-export bench faults docs panel-pictures config lock clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -108,6 +108,10 @@ studies-robustness: $(VENV)/bench.stamp  ## margins, region of attraction, distu
 
 studies-late: $(VENV)/bench.stamp  ## dead times of 10 to 120 s, measured feed, learning a dead time, 2 min -> out/studies-late
 	$(BIN)/python -m studies.late_reactor
+
+studies-acceptance: SEEDS = 2
+studies-acceptance: $(VENV)/bench.stamp  ## acceptance of models of 16 plants compared with the true plants, white and coloured noise, SEEDS=2, 40 min -> out/studies-acceptance
+	$(BIN)/python -m studies.acceptance --seeds $(SEEDS)
 
 studies-general: SEEDS = 10
 studies-general: $(VENV)/bench.stamp  ## control of seven plants with models of each class, SEEDS=10 -> out/studies-general

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Coverage of the acceptance: the bound of failing loops beside the share on the true plant.
+Coverage of the acceptance: the bound of failing loops compared with the true plant.
 
 Run by ``python -m studies.acceptance`` (needs the `train` and `bench` requirements). Each record
 has white or coloured noise; each training is written when it ends, and is not repeated.
@@ -27,11 +27,12 @@ from koopman_ros.core.plots import table, write_figures
 from koopman_ros.evaluation.closed_loop_test import evaluate_closed_loops
 from koopman_ros.learning import compare_classes, evaluate_model, Thresholds
 from koopman_ros.learning.identification import (
+    DriftModel,
     identify,
     WeakForm,
     WeakFormParameters,
 )
-from koopman_ros.model_classes import POLYNOMIAL
+from koopman_ros.model_classes import LINEAR, POLYNOMIAL
 from koopman_ros.plants import one_state_reactor, ReactorParameters
 from studies import report
 from studies.campaign import read_options
@@ -190,7 +191,9 @@ def train(case: Case, seed: int, colour: str) -> dict[str, Any]:
     box = found.drift.box
     learned = compare_classes(
         found, replace(plant, nominal_state=box.states.center, nominal_input=box.inputs.center),
-        Thresholds(margin=0.0), model_class=POLYNOMIAL, n_z=1, seed=seed, starts=1, loops=16)
+        Thresholds(margin=0.0), n_z=1,
+        model_class=LINEAR if isinstance(found.drift, DriftModel) and found.drift.linear else (
+            POLYNOMIAL), seed=seed, starts=1, loops=16)
     middle = time.process_time()
     decision = evaluate_model(found, learned, None, Thresholds(margin=0.0))
     end = time.process_time()
@@ -211,7 +214,8 @@ def train(case: Case, seed: int, colour: str) -> dict[str, Any]:
             'plants': len(about.test.loops), 'failed': int(about.test.failed.sum()),
             'loops': int(about.test.loops.sum()), 'expected': about.test.share[0],
             'bound': about.test.share[1], 'cause': dict(about.causes),
-            'rate_error': about.band.error.tolist(), 'true_rate_error': wrong.tolist(),
+            'rate_error': (learned.model.states.scale * about.band.error).tolist(),
+            'true_rate_error': wrong.tolist(),
             'held': about.held.steady.tolist()}
     return figures
 

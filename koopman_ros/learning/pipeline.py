@@ -281,6 +281,7 @@ def _with_provenance(model: LiftedModel, found: Identified, decision: Acceptance
         method=f'{found.method}, {found.drift.form}', model_class=model_class,
         accepted=decision.accepted, reasons=decision.reasons, closed_loops=decision.statement)
     return replace(model, verified_loops=decision.law_check.tried, states_measured=measured,
+                   rate_band=None if decision.plant is None else decision.plant.band,
                    provenance=origin)
 
 

@@ -18,7 +18,7 @@ from koopman_ros.learning.identification import fitted_starts, Identified, longe
 from koopman_ros.learning.identification.drift import Rate
 from koopman_ros.learning.lift.metrics import lifted_rate
 from koopman_ros.learning.retrained import Retrained
-from koopman_ros.model import Coordinates
+from koopman_ros.model import Coordinates, RateBand
 from koopman_ros.model_classes import BEST
 
 
@@ -182,13 +182,15 @@ def _draw(path: Path, retrained: Retrained) -> bool:
     n_x = len(retrained.found.drift.box.states)
     try:
         decision = retrained.decision
-        columns = 3 if decision is None else 4
+        columns = 3 if decision is None else 4 if decision.plant is None else 5
         with drawing(path, n_x, columns, size=(5.0 * columns, 4.6 * n_x)) as (figure, panels):
             for i in range(n_x):
                 row = panels[columns * i:columns * (i + 1)]
                 _draw_coverage(row[0], retrained.found, i)
                 _draw_drift(row[1], retrained, i)
                 _draw_prediction(row[2], retrained, i)
+                if decision is not None and decision.plant is not None:
+                    _draw_band(row[4], retrained, decision.plant.band, i)
                 if decision is not None:
                     draw_loops(row[3], decision.law_check, i)
                     row[3].set_title('closed loops on the estimated drift')
@@ -247,6 +249,23 @@ def _draw_drift(axes: Any, retrained: Retrained, i: int) -> None:
     axes.set(xlabel=_label(box.states, i),
              ylabel=f'difference of the rate [{box.states.units[i]}/{retrained.plant.time_unit}]',
              title='rate in the middle of the range minus the estimate')
+    axes.legend()
+
+
+def _draw_band(axes: Any, retrained: Retrained, band: RateBand, i: int) -> None:
+    """Draw a state's rate over the state where the data are, with its band and the data."""
+    assert retrained.learned is not None
+    states = retrained.learned.model.states
+    x = shown(states.to_physical(band.values)[:, i], states.units[i])
+    axes.fill_between(x, *(states.scale[i] * one[:, i] for one in (band.lower, band.upper)),
+                      color='tab:orange', alpha=0.4, linewidth=0.0, label='band')
+    axes.plot(x, states.scale[i] * band.rates[:, i], color='k', label='estimated from the data')
+    measured = np.concatenate([one.interpolated()[:, i] for one in retrained.found.episodes])
+    axes.plot(shown(measured, states.units[i]), np.full(len(measured), 0.02), '|', alpha=0.1,
+              color='tab:blue', transform=axes.get_xaxis_transform(), label='measurements')
+    axes.set(xlabel=_label(states, i),
+             ylabel=f'rate [{states.units[i]}/{retrained.plant.time_unit}]',
+             title='rate where the data are, with its band')
     axes.legend()
 
 

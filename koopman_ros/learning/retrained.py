@@ -155,7 +155,7 @@ class Retrained:
                     by_state(self.decision.current_rmse)),
                 'heldout_error_of_linear_model': by_state(self.decision.linear_rmse),
                 **({} if self.decision.plant is None else {
-                    'rate_error': by_state(self.decision.plant.band.error)}),
+                    'rate_error': by_state(trained.scale * self.decision.plant.band.error)}),
                 'heldout_rw': fit.rw,
                 'heldout_rx': fit.rx,
                 'condition': fit.cond,

@@ -15,9 +15,10 @@ from koopman_ros.model.lifted_model import (
 from koopman_ros.model.model_file import load, load_with_digest, ModelFileError, save
 from koopman_ros.model.observables import NetworkObservables, Observables, PolynomialObservables
 from koopman_ros.model.provenance import Provenance
+from koopman_ros.model.rate_band import RateBand
 from koopman_ros.model.training_data import TrainingStates, VerifiedLoops
 
 __all__ = ['APPLIED', 'COMMANDED', 'LONGEST_DEAD_TIME', 'Box', 'Coordinates', 'InputTerms',
            'LiftedModel', 'ModelFileError', 'NetworkObservables', 'Observables',
-           'PolynomialObservables', 'Provenance', 'TrainingStates', 'VerifiedLoops',
-           'linearised_model', 'load', 'load_with_digest', 'save']
+           'PolynomialObservables', 'Provenance', 'RateBand', 'TrainingStates',
+           'VerifiedLoops', 'linearised_model', 'load', 'load_with_digest', 'save']

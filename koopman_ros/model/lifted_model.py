@@ -28,6 +28,7 @@ from koopman_ros.model.coordinates import Coordinates, NO_SIGNALS
 from koopman_ros.model.input_matrix import InputTerms
 from koopman_ros.model.observables import NetworkObservables, Observables
 from koopman_ros.model.provenance import Provenance
+from koopman_ros.model.rate_band import RateBand
 from koopman_ros.model.training_data import TrainingStates, VerifiedLoops
 from koopman_ros.model_classes import (
     FREE_LIFT,
@@ -89,6 +90,8 @@ class LiftedModel:
     pre_feedback: Array | None = None
     #: closed loops of the model's law; None where they are not known, or none failed
     verified_loops: VerifiedLoops | None = None
+    #: by how much the rate of the drift may be wrong; None where no record said so
+    rate_band: RateBand | None = None
     #: (n_u,) dead time of each input in s, from its application to its effect; or one for all
     dead_time: Array = field(default_factory=lambda: np.zeros(()))
     #: the measured disturbances' names, units, nominal values, scaling and training range
@@ -157,7 +160,8 @@ class LiftedModel:
                              f'{self.input_terms.coefficients.shape}')
         for name, width in (
                 ('training_states', self.training_states and self.training_states.n_x),
-                ('verified_loops', self.verified_loops and self.verified_loops.n_x)):
+                ('verified_loops', self.verified_loops and self.verified_loops.n_x),
+                ('rate_band', self.rate_band and self.rate_band.n_x)):
             if width is not None and width != n_x:
                 raise ValueError(f'incompatible {name}: expected {n_x} states, got {width}')
 

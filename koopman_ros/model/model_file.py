@@ -24,6 +24,7 @@ from koopman_ros.model.input_matrix import InputTerms
 from koopman_ros.model.lifted_model import LiftedModel
 from koopman_ros.model.observables import NetworkObservables, PolynomialObservables
 from koopman_ros.model.provenance import Provenance
+from koopman_ros.model.rate_band import RateBand
 from koopman_ros.model.training_data import TrainingStates, VerifiedLoops
 from koopman_ros.model_classes import CLASSES
 
@@ -169,7 +170,9 @@ def _check_magnitudes(model: LiftedModel, most: Magnitudes = Magnitudes()) -> No
     axes = {'W': (None, states), 'B': (states, inputs), 'E': (states, model.disturbances.names),
             'readout': (states, None), 'pre_feedback': (inputs, states),
             'input_terms': (None, states, inputs), 'training_states': (None, states),
-            'verified_loops.starts': (None, states), 'verified_loops.setpoints': (None, states)}
+            'verified_loops.starts': (None, states), 'verified_loops.setpoints': (None, states),
+            'rate_band.error': (states,), **{f'rate_band.{name}': (None, states) for name in (
+                'values', 'rates', 'lower', 'upper')}}
     for name, array in _tensors(model).items():
         _check_size(name, array, axes.get(name, (None,) * array.ndim), most.scaled)
 
@@ -240,8 +243,9 @@ def _tensors(model: LiftedModel) -> Tensors:
         'input_terms': None if terms is None else terms.coefficients,
         'training_states': None if model.training_states is None else (
             model.training_states.states)}
-    if tried is not None:
-        found |= {f'verified_loops.{one.name}': getattr(tried, one.name) for one in fields(tried)}
+    for name, part in (('verified_loops', tried), ('rate_band', model.rate_band)):
+        if part is not None:
+            found |= {f'{name}.{one.name}': getattr(part, one.name) for one in fields(part)}
     return {name: np.ascontiguousarray(value) for name, value in found.items()
             if value is not None}
 
@@ -303,6 +307,8 @@ def _model(about: dict[str, Any], tensors: Tensors) -> LiftedModel:
     terms, known = tensors.pop('input_terms', None), tensors.pop('training_states', None)
     tried = None if 'verified_loops.starts' not in tensors else VerifiedLoops(
         *(tensors.pop(f'verified_loops.{one.name}') for one in fields(VerifiedLoops)))
+    band = None if 'rate_band.error' not in tensors else RateBand(
+        *(tensors.pop(f'rate_band.{one.name}') for one in fields(RateBand)))
     origin = dict(about['provenance'])
     origin['metrics'] = {name: float(value) for name, value in origin['metrics'].items()}
     origin['reasons'] = tuple(_of_type(list, origin, 'reasons'))
@@ -316,7 +322,7 @@ def _model(about: dict[str, Any], tensors: Tensors) -> LiftedModel:
         readout=tensors.pop('readout', None),
         input_terms=None if terms is None else InputTerms(terms),
         pre_feedback=tensors.pop('pre_feedback', None),
-        verified_loops=tried,
+        verified_loops=tried, rate_band=band,
         dead_time=np.array(_of_type(list, about, 'dead_time') if 'dead_time' in about else 0.0,
                            dtype=np.float64),
         disturbances=(_coordinates(about['disturbances']) if 'disturbances' in about

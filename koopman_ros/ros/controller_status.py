@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from koopman_ros.control import Arrival, Controller, HOLD, Mode, SAFE, State, StepReport
-from koopman_ros.control.state import TargetReport
+from koopman_ros.control.state import EstimateReport, TargetReport
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.message_fields import base_name
 from koopman_ros.core.status import level_words, Reason, StatusCode
@@ -276,6 +276,23 @@ def _warnings(now: StatusContext) -> Iterator[tuple[str, str]]:
         yield MODEL, (
             f'the disturbance estimate is at its bound of {_listed(now, tuning.max_disturbance)} '
             f'of {now.input}: the plant differs from the model; retrain')
+    if report.estimate is not None and (beyond := _beyond_band(report.estimate)):
+        yield MODEL, beyond
+
+
+def _beyond_band(estimate: EstimateReport) -> str:
+    """Return which rates differ from the model by more than its record allows, or ''."""
+    model = estimate.estimator.model
+    if model.rate_band is None:
+        return ''
+    errors, allowed = (model.states.scale * np.abs(one) for one in (
+        estimate.estimate.w, model.rate_band.error))
+    different = ', '.join(
+        f'the rate of {name} differs from the model by {error:.2g} {unit}/{model.time_unit}, the '
+        f'record allows {most:.2g}' for name, unit, error, most in zip(
+            model.states.names, model.states.units, errors.tolist(), allowed.tolist(), strict=True)
+        if error > most)
+    return different and f'{different}: a disturbance acts, or the plant has changed; retrain then'
 
 
 def _untrained(box: Coordinates, values: Array) -> str:

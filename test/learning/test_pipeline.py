@@ -130,9 +130,12 @@ def test_rejected_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_pa
     assert rejected.provenance.accepted is False
     assert rejected.provenance.reasons == retrained.reasons
     again = tmp_path / 'again.safetensors'
-    save(replace(rejected, provenance=replace(
+    accepted_one = load(present)
+    assert accepted_one.rate_band is not None
+    # a model that is worse than the current one runs no loops on other plants
+    save(replace(rejected, rate_band=accepted_one.rate_band, provenance=replace(
         rejected.provenance, accepted=True, reasons=(),
-        closed_loops=load(present).provenance.closed_loops)), again)
+        closed_loops=accepted_one.provenance.closed_loops)), again)
     assert again.read_bytes() == present.read_bytes()
 
 

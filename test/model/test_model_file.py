@@ -26,6 +26,7 @@ from koopman_ros.model import (
     model_file,
     ModelFileError,
     PolynomialObservables,
+    RateBand,
     save,
     TrainingStates,
     VerifiedLoops,
@@ -52,6 +53,8 @@ MODELS = {
     'read-out': replace(PLAIN, readout=RNG.normal(size=(2, 7))),
     'pre-feedback': replace(random_lift(n_u=2), pre_feedback=RNG.normal(size=(2, 2))),
     'input terms': replace(PLAIN, input_terms=InputTerms(RNG.normal(size=(5, 2, 1)))),
+    'band of the rate': replace(PLAIN, rate_band=RateBand(
+        np.full(PLAIN.n_x, 0.1), *(np.full((3, PLAIN.n_x), k) for k in (0.5, 1.0, 0.9, 1.1)))),
     'tried loops': replace(PLAIN, verified_loops=VerifiedLoops(
         *RNG.normal(size=(2, 7, 2)), np.arange(7) % 3 == 0)),
     'rejected': with_origin(model_class='neural drift', accepted=False,
@@ -251,6 +254,8 @@ ARRAYS: list[tuple[str, dict[str, Any], str]] = [
     ('disturbances', {'E': np.full((2, 2), np.nan)}, 'E must be finite'),
     ('network', {'E': np.ones((2, 1))}, 'incompatible E: expected (2, 0)'),
     ('input terms', {'input_terms': np.zeros((4, 2, 1))}, 'incompatible input terms'),
+    ('band of the rate', {'rate_band.lower': np.zeros((2, 2))}, 'rate_band.lower'),
+    ('band of the rate', {'rate_band.upper': None}, 'rate_band.upper'),
     ('tried loops', {'verified_loops.lost': np.zeros(7)}, 'has type float64'),
     ('tried loops', {'verified_loops.lost': None}, 'lost'),
     ('monomials', {'exponents': np.eye(5, 2)}, 'has type float64'),

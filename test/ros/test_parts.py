@@ -28,7 +28,7 @@ from koopman_ros.control.laws import Plan
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.demo import reactor
-from koopman_ros.model import load
+from koopman_ros.model import load, RateBand
 from koopman_ros.nodes.controller import ControllerNode
 from koopman_ros.nodes.plant import PlantNode
 from koopman_ros.nodes.trainer import TrainerNode
@@ -306,6 +306,20 @@ def test_a_disturbance_at_its_bound_is_a_warning_of_the_model() -> None:
         report, estimate=report.estimate._replace(estimate=large))))
     assert (found['model'].level, found['control'].level) == (Severity.WARN,) * 2
     assert 'at its bound' in found['model'].message
+
+
+@pytest.mark.parametrize(('share', 'warned'), [(0.9, False), (-1.1, True)])
+def test_a_rate_beyond_the_band_of_the_record_is_a_warning_of_the_model(
+        share: float, warned: bool) -> None:
+    model = load(model_path('reactor_nz4'))
+    model = replace(model, rate_band=RateBand(np.array([0.1]), *np.zeros((4, 2, 1))))
+    own = built(table_of(model, {'system': 'reactor'}).snapshot({}), model)
+    state, _, report = own.step(State(), model.states.center, NANOSECONDS)
+    estimate = replace(report.estimate.estimate, w=np.array([0.1 * share]))
+    found = statuses(context(own, state, replace(
+        report, estimate=report.estimate._replace(estimate=estimate))))['model']
+    assert (found.level is Severity.WARN) is warned
+    assert ('the rate of temperature differs' in found.message) is warned
 
 
 def test_a_request_is_repeated_until_one_is_answered() -> None:

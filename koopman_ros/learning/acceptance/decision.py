@@ -17,7 +17,7 @@ from koopman_ros.learning.acceptance.held_out import HeldOut
 from koopman_ros.learning.acceptance.held_range import held_shares, HeldShares
 from koopman_ros.learning.acceptance.missing_structure import missing_structure
 from koopman_ros.learning.acceptance.plant_test import PlantTest
-from koopman_ros.learning.acceptance.rate_band import rate_band, RateBand
+from koopman_ros.learning.acceptance.rate_band import rate_band
 from koopman_ros.learning.acceptance.settings import Thresholds
 from koopman_ros.learning.acceptance.warnings import record_warnings
 from koopman_ros.learning.acceptance.words import statement
@@ -31,13 +31,13 @@ from koopman_ros.learning.linearisation import (
     unfounded_instability,
 )
 from koopman_ros.learning.model_selection import ClassComparison
-from koopman_ros.model import LiftedModel
+from koopman_ros.model import LiftedModel, RateBand
 from koopman_ros.model_classes import LINEAR
 
 
 @dataclass(frozen=True)
 class PlantAcceptance:
-    """What the record says about the plant under a model's law."""
+    """Result of the closed loops on plausible plants, with the reasons of a rejection."""
 
     test: PlantTest  #: closed loops on plausible plants
     band: RateBand  #: of the drift that they span
@@ -133,17 +133,18 @@ def _plant_acceptance(held_out: HeldOut, found: Identified, model: LiftedModel,
     plants = posterior.draw(settings.plants)
     # other drifts of the identification are plausible plants, too
     others = found.alternatives[:settings.alternatives]
-    test = held_out.plant_test(model, [
-        one.rate for one in (*others, *plants)][:settings.plants], watch, backend)
+    rates = [*(one.rate for one in others), *(one.rate for one in plants)]
+    test = held_out.plant_test(model, rates[:settings.plants], watch, backend)
     x = np.concatenate([one.interpolated() for one in episodes])
     u = np.concatenate([one.inputs_at(one.time) for one in episodes])
-    band = rate_band(drift, plants, x, u, settings)
+    band = rate_band(drift, plants, x, u, model.states, settings)
     measured = len(model.states) - found.hidden
     held = held_shares(model, x, test.setpoints, setpoints,
                        ~np.isin(model.inputs.names, found.disturbances), measured, settings)
     missing = missing_structure(posterior)
-    text = statement(test, band.error[:measured], model.states.only(
-        model.states.names[:measured]), model.time_unit)
+    names = model.states.names[:measured]
+    text = statement(test, (model.states.scale * band.error)[:measured], model.states.only(names),
+                     model.time_unit)
     reasons = [] if test.accepted else [
         f'{text}: ' + (missing.text if missing else f'{held_out.other_class}record longer, with '
                        'steps of the inputs in the whole range')]

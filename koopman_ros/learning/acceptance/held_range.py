@@ -60,17 +60,18 @@ def held_shares(model: LiftedModel, recorded: Array, setpoints: Array,
     """
     names = model.states.names[:measured]
     trim, points = settings.trimmed, settings.held_points
-    ranges = np.quantile(recorded[:, :measured], [trim, 1.0 - trim], axis=0)
+    low, high = np.quantile(recorded[:, :measured], [trim, 1.0 - trim], axis=0)
     some = setpoints[np.linspace(0, len(setpoints) - 1, min(points, len(setpoints))).astype(int)]
 
     def share(i: int, values: Array) -> float:
         return float(np.mean(_held(model, i, values, manipulated))) if len(values) else 0.0
 
     return HeldShares(
-        names, np.array([share(i, np.linspace(*ranges[:, i], points)) for i in range(measured)]),
+        names, np.array([share(i, np.linspace(low[i], high[i], points))
+                         for i in range(measured)]),
         np.array([share(i, some[:, i]) for i in range(measured)]) if len(some) else np.zeros(0),
-        {name: share(names.index(name), np.linspace(low, high, points))
-         for name, (low, high) in requested.items() if name in names})
+        {name: share(names.index(name), np.linspace(ends[0], ends[1], points))
+         for name, ends in requested.items() if name in names})
 
 
 def _held(model: LiftedModel, i: int, values: Array, manipulated: NDArray[np.bool_]

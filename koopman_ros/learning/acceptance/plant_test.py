@@ -71,7 +71,7 @@ def share_bound(failed: Sequence[int] | NDArray[np.int64], loops: Sequence[int] 
     and at least that of C. Clopper and E. Pearson, Biometrika 26 (1934) 404, for all loops.
 
     :param failed: (M,) counts of the plants.
-    :param loops: (M,) likewise, at least 1.
+    :param loops: (M,) all loops of each, at least 1.
     """
     # in here: no node needs it
     from scipy.special import betaincinv

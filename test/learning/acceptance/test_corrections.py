@@ -124,8 +124,9 @@ def test_the_band_covers_the_error_of_an_estimate_and_falls_with_the_noise():
     for sigma in (0.02, 0.002):
         found = correction_posterior(LINEAR, OWN, [recorded(lambda u: GAIN * u, sigma=sigma)])
         episode = recorded(lambda u: GAIN * u)
-        band = rate_band(LINEAR, found.draw(40), episode.x, episode.inputs_at(episode.time))
-        errors.append(float(band.error[0]))
+        band = rate_band(LINEAR, found.draw(40), episode.x, episode.inputs_at(episode.time),
+                         BOX.states)
+        errors.append(2.0 * float(band.error[0]))
         true = GAIN * np.linspace(-1.0, 1.0, 11) - 0.3
         assert np.all(np.abs(LINEAR.rate(np.full((11, 1), 0.3), np.linspace(
             -1.0, 1.0, 11)[:, None])[:, 0] - true) <= errors[-1])
