@@ -10,6 +10,7 @@ has white or coloured noise; each training is written when it ends, and is not r
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 import json
 import math
 from pathlib import Path
@@ -159,6 +160,10 @@ CASES: dict[str, Case] = {
 }
 
 
+def _under(rate: Callable[[Array, Array], Array], u: Array, x: Array) -> Array:
+    return rate(x, u)
+
+
 def record(case: Case, seed: int, colour: str) -> tuple[PlantDescription, Episode]:
     """Return a record under random steps, with noise, the inputs as they act."""
     rng = np.random.default_rng([seed, COLOURS.index(colour)])
@@ -167,18 +172,20 @@ def record(case: Case, seed: int, colour: str) -> tuple[PlantDescription, Episod
     u = np.repeat(rng.uniform(low, high, (steps, len(low))), case.hold, axis=0)[:SAMPLES]
     x = [np.array(case.start, dtype=np.float64)]
     for v in u[:-1]:
-        x.append(integrate(lambda y, v=v: case.rate(y, v), x[-1], case.period, SUBSTEPS))
+        x.append(integrate(partial(_under, case.rate, v), x[-1], case.period, SUBSTEPS))
     noise = rng.standard_normal((SAMPLES, len(case.start)))
     if colour == 'coloured':
         for k in range(1, SAMPLES):
             noise[k] = COLOUR * noise[k - 1] + math.sqrt(1.0 - COLOUR ** 2) * noise[k]
-    states, time_s = np.array(x), case.period * np.arange(SAMPLES)
+    states: Array = np.array(x)
+    time_s: Array = case.period * np.arange(SAMPLES, dtype=np.float64)
     n, m = len(case.start), len(low)
     plant = PlantDescription(
         'plant', tuple(f'x{i + 1}' for i in range(n)), ('1',) * n,
         tuple(f'u{j + 1}' for j in range(m)), ('1',) * m, 's', np.full(n, np.nan),
         np.full(m, np.nan), None, input_matrix_degree=case.input_degree)
-    return plant, Episode(time_s, states + NOISE * np.ptp(states, axis=0) * noise, time_s, u)
+    measured: Array = states + NOISE * np.ptp(states, axis=0) * noise
+    return plant, Episode(time_s, measured, time_s, u)
 
 
 def train(case: Case, seed: int, colour: str) -> dict[str, Any]:

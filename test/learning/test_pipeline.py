@@ -148,7 +148,7 @@ def test_report_without_matplotlib(accepted, monkeypatch):
     assert figures == retrained.summary()
     assert figures['accepted'] is True
     said = figures['closed_loop_statement']
-    assert ' 0 of 6 loops ' in said
+    assert ' 0 of 8 loops ' in said
     assert 'simulated closed loops: ' + said in str(load(retrained.model_file))
     assert figures['measurements_used'] == figures['measurements_read'] == 1201
     # UA is 0.8 of 2.092 1/min

@@ -39,7 +39,7 @@ def quick_retraining(loops: int, degrees: tuple[int, ...] = (1, 3),
         patch.setattr(pipeline, 'compare_classes', partial(compare_classes, loops=loops))
         patch.setattr(pipeline, 'evaluate_model', partial(evaluate_model, loops=loops))
         patch.setattr(pipeline, 'Thresholds', partial(
-            Thresholds, plants=3, plant_loops=2, most_failing=0.5))
+            Thresholds, plants=2, plant_loops=4, most_failing=0.5))
         yield
 
 

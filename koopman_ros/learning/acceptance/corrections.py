@@ -33,7 +33,7 @@ class OwnTerms(NamedTuple):
     """The terms that an estimated drift has itself: its uncertainty is that of its fit."""
 
     degree: int  #: of the terms in x alone
-    input_degree: int  #: of the factors in x of terms linear in u
+    input_degree: int  #: of the factors in x of terms linear in u; -1 for none
 
 
 @dataclass(frozen=True)

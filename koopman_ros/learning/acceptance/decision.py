@@ -162,7 +162,8 @@ def _own_terms(drift: Drift) -> OwnTerms:
         return _own_terms(drift.drift)
     if isinstance(drift, LaggedDrift):
         degree, input_degree = _own_terms(drift.drift)
-        # applied inputs are states
-        return OwnTerms(max(degree, 1 + input_degree), input_degree)
+        # applied inputs are states, and their commands have no effect but by these
+        return OwnTerms(max(degree, 1 + input_degree),
+                        input_degree if np.any(drift.lag == 0.0) else -1)
     return OwnTerms(drift.degree, drift.input_degree) if isinstance(drift, DriftModel) else (
         OwnTerms(1, 0))

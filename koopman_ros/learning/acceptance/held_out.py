@@ -3,7 +3,7 @@
 
 """Requirements on a model on the part of the record that it was not learned from."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -70,7 +70,7 @@ class HeldOut:
     def _delayed(self, model: LiftedModel) -> LiftedModel:
         return replace(model, dead_time=self._seconds * self._found.dead_time)
 
-    def plant_test(self, model: LiftedModel, rates: list[Rate], watch: Callable[[float], bool],
+    def plant_test(self, model: LiftedModel, rates: Sequence[Rate], watch: Callable[[float], bool],
                    backend: Backend | None) -> PlantTest:
         """
         Close the loop on plants that the record cannot distinguish; see :func:`run_plants`.
