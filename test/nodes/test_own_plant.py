@@ -33,7 +33,7 @@ RECORD, SIMULATE, TRAIN, CONTROL, RUN, *_ = (
     (node, tuple(shlex.split(text))) for node, text in re.findall(
         r'^ros2 run koopman_ros (\w+) --ros-args (--params-file .*)$', PAGE, re.MULTILINE))
 ACCEPTED = r'the new model \(.+?\) is accepted: its error on held-out data is ([\d.]+) K, ' \
-    r'that of the best linear model ([\d.]+) K; written to (\S+\.safetensors)'
+    r'that of the best linear model ([\d.]+) K; written to (\S+\.safetensors)\. On \d+ plants .*'
 
 
 @pytest.fixture(scope='module')
