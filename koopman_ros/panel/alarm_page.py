@@ -15,6 +15,7 @@ from nicegui.element import Element
 from koopman_ros.panel.alarms import Alarm, AlarmState, Priority
 from koopman_ros.panel.conditions import grouped
 from koopman_ros.panel.layout import (
+    alarm_counts,
     attribute,
     box,
     clock,
@@ -40,21 +41,15 @@ def alarm_strip(page: PageLayout) -> None:
     """Show the most urgent unacknowledged alarm of each page, and the numbers of all."""
     with page.strip:
         rows = _AlarmRows('Most urgent alarm', lambda alarm: _row(page, alarm, ()))
-        counts = link('', '/alarms').classes('counts')
+        counts = link('', f'{page.prefix}/alarms').classes('counts')
         attribute(ui.element('button').props('id=sound type=button'), 'aria-label', 'Sound')
 
     def show(now: Snapshot) -> None:
         waiting = unacknowledged(now.standing)
         rows.show([(alarm, '') for alarm in waiting[:1]], now)
-        counts.set_text(_counts(now))
+        counts.set_text(alarm_counts(now))
 
     page.follow(show)
-
-
-def _counts(now: Snapshot) -> str:
-    numbers = {'unacknowledged': len(unacknowledged(now.standing)), 'active': len(now.standing),
-               'shelved': len(now.shelved)}
-    return ' · '.join(f'{count} {what}' for what, count in numbers.items() if count) or 'No alarms'
 
 
 class _Choice:

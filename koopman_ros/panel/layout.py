@@ -6,10 +6,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from importlib.resources import files
+import operator
 import re
 import time
 from typing import Any, Protocol, Self, TypeVar
@@ -27,9 +28,10 @@ PERIOD = 0.25  # s between two updates of a page
 _TIMEOUT = 40.0  # s for an answer
 TABS = {'/': 'Overview', '/trends': 'Trends', '/alarms': 'Alarms', '/model': 'Model',
         '/tuning': 'Tuning', '/audit': 'Audit'}
+LOOPS = 'Loops'  #: name of the page of all loops
 _CSS, _WATCH = ((files(__package__) / name).read_text() for name in ('style.css', 'watch.js'))
-_TEXTS = ('alt', 'aria-label', 'data-answered', 'data-beat', 'data-parameter', 'data-present',
-          'data-signal', 'data-sound', 'data-title')
+_TEXTS = ('alt', 'aria-label', 'data-answered', 'data-beat', 'data-loop', 'data-parameter',
+          'data-present', 'data-signal', 'data-sound', 'data-title')
 _SETTLED = 2.0  # s after which an answer no longer holds if the loop changes
 #: frequency of the sound in Hz, and symbol, of each priority
 SOUNDS = {Priority.HIGH: '880', Priority.MEDIUM: '660', Priority.LOW: '440'}
@@ -42,7 +44,7 @@ NOT_ALLOWED = {role: Answer(False, f'for {role.value}s only: log in as {role.val
 
 
 class Source(Protocol):
-    """Interface of the node for the pages."""
+    """Interface of a loop for the pages."""
 
     view: LoopViewModel  #: its trends and alarms may be used by any thread
     snapshot: Snapshot  #: of now
@@ -53,7 +55,7 @@ class Source(Protocol):
 
     @property
     def title(self) -> str:
-        """Title of all pages."""
+        """Title of its pages."""
 
     def request(self, action: Action) -> Future[Answer]:
         """Carry out an action of an operator; called from any thread."""
@@ -78,71 +80,63 @@ def clock(seconds: float) -> str:
     return time.strftime('%H:%M:%S', time.localtime(seconds))
 
 
-class PageLayout:
-    """
-    A page; its content goes into `body`.
+def prefix_of(loop: str) -> str:
+    """Return the path before those of the pages of a loop; '' for the only one of a panel."""
+    return f'/loop{loop}' if loop else ''
 
-    :param path: of the page.
+
+class Frame:
+    """
+    Common part of all pages: style, head, heartbeat, and the most urgent alarm in the title.
+
+    :param sources: loops of the panel by namespace; the only one has the name ''.
+    :param path: of the page, to which the visitor returns after a new log-in.
+    :param name: of the page.
+    :param shown: loops on the page.
     """
 
-    def __init__(self, source: Source, visitor: Visitor, path: str) -> None:
-        self.source, self.visitor, self._path = source, visitor, path
+    def __init__(self, sources: Mapping[str, Source], visitor: Visitor, path: str, name: str,
+                 shown: Sequence[Source]) -> None:
+        self.sources, self.visitor, self._path = sources, visitor, path
+        self._name, self._of = name, shown
         # without a look at the session, which would be a use of it
         self._role = visitor.role()
-        self._shown: Snapshot | None = None
+        self.snapshots: list[Snapshot] = []  #: of the loops on the page
         self._updates: list[Callable[[Snapshot], None]] = []
         self._beat_at = 0.0
         ui.add_css(_CSS)
         ui.add_head_html(f'<script>{_WATCH}</script>')
-        ui.page_title(f'{TABS[path]} – {source.title}')
+        ui.page_title(self._title)
         ui.colors(primary='#4a4a47', secondary='#6b6b67', accent='#4a4a47', positive='#4a4a47')
-        self._head(path)
-        self.body = box('page')
-
-    def _head(self, path: str) -> None:
-        with box('head', tag='header') as head:
-            title = label('h1', self.source.title)
-            mode, level = label('div', ''), label('div', '', 'quiet')
-            experiment = label('div', '', 'abnormal hidden')
-            beat = label('div', '', 'right quiet').props('id=beat')
-            label('div', f'{self.visitor.name} ({self._role.value})' if self.visitor.named else (
-                self.visitor.name), 'quiet')
-            if self.visitor.named:
+        with box('head', tag='header') as self._header:
+            self._heading = label('h1', '')
+            self._details = box('details')  # of the loop
+            self._beat = label('div', '', 'right quiet').props('id=beat')
+            label('div', f'{visitor.name} ({self._role.value})' if visitor.named else (
+                visitor.name), 'quiet')
+            if visitor.named:
                 link('Log out', '/logout')
-        self.strip = box('row1 strip-head')  #: place of the most urgent alarm
-        with box('tabs', tag='nav').props('aria-label=Pages'):
-            tabs = {target: link(name, target) for target, name in TABS.items()}
-        tabs[path].classes('here').props('aria-current=page')
-        banner = label('div', '', 'banner hidden').props('role=alert')
+        self.follow(self._show)
 
-        def show(now: Snapshot) -> None:
-            title.set_text(self.source.title)
-            mode.set_text(now.mode.upper() or 'MODE NOT KNOWN')
-            level.set_text(now.level if now.level != now.mode else '')
-            experiment.set_text(f'EXPERIMENT, {now.experiment} s left')
-            show_if(experiment, bool(now.experiment))
-            waiting = unacknowledged(now.standing)
-            worst = waiting[0].priority if waiting else None
-            tabs['/alarms'].set_text(f'Alarms ({len(waiting)})' if waiting else 'Alarms')
-            found = f'{TABS[path]} – {self.source.title}'
-            attribute(head, 'data-title', f'{SYMBOLS[worst]} {worst.word.upper()} '
-                      f'({len(waiting)}) {found}' if worst else found)
-            attribute(head, 'data-sound', SOUNDS[worst] if worst else '')
-            # the panel's clock that a page has seen last tells the age of what is pressed there
-            if (beat_at := time.monotonic()) - self._beat_at >= 1.0:
-                self._beat_at = beat_at
-                beat.set_text(f'wall time {clock(now.wall)}')
-                attribute(beat, 'data-beat', f'{beat_at:.1f}')
-            silent = [f'no message from the {one.role} since {clock(one.since)}' + (
-                '' if one.seen else ', the start of the panel') for one in now.silences]
-            known = any(one.seen for one in now.silences)
-            banner.set_text(f'⚠ {"Connection lost" if known else "Waiting"}: {"; ".join(silent)}')
-            show_if(banner, bool(silent))
+    @property
+    def _title(self) -> str:
+        return self._name if len(self._of) != 1 else f'{self._name} – {self._of[0].title}'
 
-        self.follow(show)
+    def _show(self, now: Snapshot) -> None:
+        self._heading.set_text(self._of[0].title if len(self._of) == 1 else self._name)
+        count, worst = urgency(self.snapshots if len(self._of) == len(self.sources) else [
+            source.snapshot for source in self.sources.values()])
+        attribute(self._header, 'data-title', f'{SYMBOLS[worst]} {worst.word.upper()} '
+                  f'({count}) {self._title}' if worst else self._title)
+        attribute(self._header, 'data-sound', SOUNDS[worst] if worst else '')
+        # the panel's clock that a page has seen last tells the age of what is pressed there
+        if (beat_at := time.monotonic()) - self._beat_at >= 1.0:
+            self._beat_at = beat_at
+            self._beat.set_text(f'wall time {clock(now.wall)}')
+            attribute(self._beat, 'data-beat', f'{beat_at:.1f}')
 
     def follow(self, update: Callable[[Snapshot], None]) -> None:
-        """Call a function with each new snapshot."""
+        """Call a function with each new snapshot of the first loop on the page."""
         self._updates.append(update)
 
     def run(self) -> None:
@@ -151,18 +145,66 @@ class PageLayout:
         self._timer = ui.timer(PERIOD, self.update)
 
     def update(self) -> None:
-        """Show a new snapshot."""
-        now = self.source.snapshot
-        if now is self._shown:
+        """Show new snapshots."""
+        now = [source.snapshot for source in self._of]
+        if self.snapshots and all(map(operator.is_, now, self.snapshots)):
             return
-        self._shown = now
+        self.snapshots = now
         if not self.visitor.may_look():
             # logged out on another page, or idle for too long
             self._timer.cancel()
             ui.navigate.to(f'/login?page={self._path}')
             return
         for update in self._updates:
-            update(now)
+            update(now[0])
+
+
+class PageLayout(Frame):
+    """
+    A page of a loop; its content goes into `body`.
+
+    :param loop: its name in `sources`.
+    :param path: of the page, without the prefix of the loop.
+    """
+
+    def __init__(self, sources: Mapping[str, Source], loop: str, visitor: Visitor, path: str
+                 ) -> None:
+        self.source, self.prefix = sources[loop], prefix_of(loop)
+        super().__init__(sources, visitor, self.prefix + path, TABS[path], [self.source])
+        self._head(path)
+        self.body = box('page')
+
+    def _head(self, path: str) -> None:
+        with self._details:
+            mode, level = label('div', ''), label('div', '', 'quiet')
+            experiment = label('div', '', 'abnormal hidden')
+        self.strip = box('row1 strip-head')  #: place of the most urgent alarm
+        others = [one for one in self.sources.values() if one is not self.source]
+        with box('tabs', tag='nav').props('aria-label=Pages'):
+            loops = link('', '/') if others else None
+            tabs = {target: link(name, self.prefix + target) for target, name in TABS.items()}
+        tabs[path].classes('here').props('aria-current=page')
+        banner = label('div', '', 'banner hidden').props('role=alert')
+
+        def show(now: Snapshot) -> None:
+            mode.set_text(now.mode.upper() or 'MODE NOT KNOWN')
+            level.set_text(now.level if now.level != now.mode else '')
+            experiment.set_text(f'EXPERIMENT, {now.experiment} s left')
+            show_if(experiment, bool(now.experiment))
+            waiting = unacknowledged(now.standing)
+            tabs['/alarms'].set_text(f'Alarms ({len(waiting)})' if waiting else 'Alarms')
+            if loops is not None:
+                count, worst = urgency(one.snapshot for one in others)
+                loops.set_text(f'{LOOPS}: {SYMBOLS[worst]} {worst.word.upper()} ({count})'
+                               if worst else LOOPS)
+                loops.classes(replace=f'urgent {worst.word}' if worst else '')
+            silent = [f'no message from the {one.role} since {clock(one.since)}' + (
+                '' if one.seen else ', the start of the panel') for one in now.silences]
+            known = any(one.seen for one in now.silences)
+            banner.set_text(f'⚠ {"Connection lost" if known else "Waiting"}: {"; ".join(silent)}')
+            show_if(banner, bool(silent))
+
+        self.follow(show)
 
     def card(self, title: str, name: str, role: str) -> Element:
         """Return a card that is grey, with controls that do nothing, while a node is silent."""
@@ -283,6 +325,19 @@ def unacknowledged(alarms: Sequence[Alarm]) -> list[Alarm]:
     return [alarm for alarm in alarms if alarm.state is not AlarmState.ACKNOWLEDGED]
 
 
+def alarm_counts(now: Snapshot) -> str:
+    """Write the numbers of alarms of a loop."""
+    numbers = {'unacknowledged': len(unacknowledged(now.standing)), 'active': len(now.standing),
+               'shelved': len(now.shelved)}
+    return ' · '.join(f'{count} {what}' for what, count in numbers.items() if count) or 'No alarms'
+
+
+def urgency(snapshots: Iterable[Snapshot]) -> tuple[int, Priority | None]:
+    """Return the number of unacknowledged alarms, and the highest priority of them."""
+    waiting = [alarm.priority for now in snapshots for alarm in unacknowledged(now.standing)]
+    return len(waiting), max(waiting, key=lambda one: one.value, default=None)
+
+
 class Lines:
     """List of lines, which is drawn again when they change."""
 
@@ -306,6 +361,13 @@ def show_if(element: Element, shown: bool) -> None:
     """Show or hide an element."""
     if shown is ('hidden' in element.classes):
         element.classes(**{'remove' if shown else 'add': 'hidden'})
+
+
+def show_value(element: ui.label, text: str, old: bool) -> None:
+    """Show a value, marked where the node that sends it is silent."""
+    element.set_text(f'? {text}' if old and text else text)
+    if old is not ('old' in element.classes):
+        element.classes(**{'add' if old else 'remove': 'old'})
 
 
 def place(element: Element, **sides: float) -> None:

@@ -4,7 +4,7 @@
 """Log-in and log-out: the visitor of a request, and the log-in page."""
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from html import escape
@@ -18,7 +18,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from starlette.requests import ClientDisconnect
 
 from koopman_ros.panel.access import Users
-from koopman_ros.panel.layout import Source, TABS, Visitor
+from koopman_ros.panel.layout import Visitor
 from koopman_ros.panel.requests import Role
 from koopman_ros.panel.sessions import Session, Sessions, Throttle
 
@@ -62,13 +62,19 @@ class AccessControl:
                        lambda: self.session(scope, use=False) is not None, self.users is not None)
 
 
-def add_login(app: FastAPI, source: Source, keeper: AccessControl) -> None:
-    """Serve the pages by which users log in and out."""
+def add_login(app: FastAPI, title: Callable[[], str], pages: Collection[str],
+              keeper: AccessControl) -> None:
+    """
+    Serve the pages by which users log in and out.
+
+    :param title: of the panel.
+    :param pages: paths to which a user may return.
+    """
     def login_form(page: str, message: str = '', status: int = 200) -> HTMLResponse:
         shown = f'<p role="alert">{escape(message)}</p>' if message else ''
         return HTMLResponse(_PAGE.substitute(
-            title=escape(source.title), message=shown,
-            query=f'?page={page}' if page in TABS else ''), status, {'cache-control': 'no-store'})
+            title=escape(title()), message=shown,
+            query=f'?page={page}' if page in pages else ''), status, {'cache-control': 'no-store'})
 
     # one log-in at a time takes the memory of argon2, and no thread of the pages
     verifier = ThreadPoolExecutor(1, 'log-in')
@@ -100,7 +106,7 @@ def add_login(app: FastAPI, source: Source, keeper: AccessControl) -> None:
             return form('name or password is wrong', 401)
         keeper.throttle.succeeded(address, name)
         request.session[_ID] = keeper.sessions.open(name, role)
-        return RedirectResponse(page if page in TABS else '/', 303)
+        return RedirectResponse(page if page in pages else '/', 303)
 
     @app.get('/session', status_code=204)
     async def session() -> None:

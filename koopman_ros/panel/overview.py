@@ -13,7 +13,16 @@ from nicegui import ui
 from nicegui.element import Element
 
 from koopman_ros.panel.faceplates import Faceplate, InputFaceplate, number, StateFaceplate
-from koopman_ros.panel.layout import AnswerLine, attribute, box, label, PageLayout, place, show_if
+from koopman_ros.panel.layout import (
+    AnswerLine,
+    attribute,
+    box,
+    label,
+    PageLayout,
+    place,
+    show_if,
+    show_value,
+)
 from koopman_ros.panel.requests import Answer
 from koopman_ros.panel.snapshot import CONTROL, CONTROLLER, PLANT, Snapshot, TRAINER
 from koopman_ros.panel.trend_chart import TrendChart
@@ -79,7 +88,7 @@ class _Faceplate:
     def show(self, face: Faceplate, value: float, mark: float, old: bool) -> None:
         self._abnormal.set_text(f'▲ {face.abnormal}')
         show_if(self._abnormal, bool(face.abnormal))
-        _show_value(self._number, face.text(value), old)
+        show_value(self._number, face.text(value), old)
         self._bar.show(face, value, mark)
         self._active.set_text(f'planned: {face.active}' if face.active else '')
 
@@ -154,13 +163,6 @@ async def _experiment_goes_on(page: PageLayout, signal: str) -> bool:
          'and ends with this entry.'])
 
 
-def _show_value(element: ui.label, text: str, old: bool) -> None:
-    """Show a value, marked where the node that sends it is silent."""
-    element.set_text(f'? {text}' if old and text else text)
-    if old is not ('old' in element.classes):
-        element.classes(**{'add' if old else 'remove': 'old'})
-
-
 def _signal_card(face: Faceplate) -> Element:
     return attribute(attribute(box('card', tag='section'), 'aria-label', face.label),
                      'data-signal', face.name)
@@ -187,12 +189,12 @@ def _state_card(page: PageLayout, at: int, face: StateFaceplate) -> None:
         own = now.states[at]
         plate.show(own, own.measured, own.setpoint, 'measured' in own.old)
         if face.controlled:
-            _show_value(setpoint, f'{own.exact(own.setpoint)} {own.unit}', 'setpoint' in own.old)
+            show_value(setpoint, f'{own.exact(own.setpoint)} {own.unit}', 'setpoint' in own.old)
             ramps = math.isfinite(own.target) and own.text(own.target) != own.text(own.setpoint)
             target.set_text(
                 f'target {own.exact(own.target)} {own.unit} (ramping)' if ramps else '')
             entry.show(own, own.target, now.obstacle)
-        _show_value(predicted, f'model prediction {number(own.predicted, own.decimals + 1)} '
+        show_value(predicted, f'model prediction {number(own.predicted, own.decimals + 1)} '
                     f'{own.unit}' if math.isfinite(own.predicted) else
                     'measured disturbance' if own.disturbance else '', 'predicted' in own.old)
 
@@ -218,7 +220,7 @@ def _input_card(page: PageLayout, at: int, face: InputFaceplate) -> None:
     def show(now: Snapshot) -> None:
         own = now.inputs[at]
         plate.show(own, own.command, own.applied, 'command' in own.old)
-        _show_value(applied, f'{own.text(own.applied)} {own.unit}', 'applied' in own.old)
+        show_value(applied, f'{own.text(own.applied)} {own.unit}', 'applied' in own.old)
         limits = f'limits {own.span_text(own.limits)} {own.unit}' if own.limits else (
             'limits not known')
         change = own.disturbance

@@ -25,7 +25,7 @@ from koopman_ros.panel.snapshot import Snapshot, TRAINING
 from koopman_ros.panel.training_report import Findings, ReplayComparison, TrainingReport
 
 
-def _findings(name: str, about: str) -> Callable[[Findings], None]:
+def _findings(address: str, about: str) -> Callable[[Findings], None]:
     """Add lines, picture and text of a report; return the function that shows them."""
     lines = label('div', '', 'lines')
     picture = attribute(ui.element('img').classes('picture hidden'), 'alt', about)
@@ -37,7 +37,7 @@ def _findings(name: str, about: str) -> Callable[[Findings], None]:
         if found.picture:
             # another address for another picture
             version = hashlib.sha256(found.picture).hexdigest()[:16]
-            attribute(picture, 'src', f'/picture/{name}?{version}')
+            attribute(picture, 'src', f'{address}?{version}')
         show_if(picture, bool(found.picture))
         text.set_text(found.text)
         show_if(whole, bool(found.text))
@@ -50,7 +50,7 @@ def report_card(page: PageLayout) -> None:
     with card('report of the last training', 'Report').classes('hidden') as own:
         verdict, when = label('div', '', 'value'), label('div', '', 'quiet')
         problem = label('div', '')
-        show_findings = _findings('training', 'Data, drift and prediction')
+        show_findings = _findings(f'{page.prefix}/picture/training', 'Data, drift and prediction')
     shown: list[TrainingReport | None] = [None]
 
     def show(_: Snapshot) -> None:
@@ -87,7 +87,8 @@ def comparison_card(page: PageLayout) -> None:
             end = page.button('Cancel', cancel)
         answer = AnswerLine(page)
         state = label('div', '').props('role=status')
-        show_findings = _findings('comparison', 'Recorded commands and those of the new model')
+        show_findings = _findings(f'{page.prefix}/picture/comparison',
+                                  'Recorded commands and those of the new model')
     shown = [ReplayComparison()]
 
     def model() -> str:

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 import logging
 import secrets
 import socket
@@ -27,8 +27,9 @@ from koopman_ros.panel.access import Users
 from koopman_ros.panel.alarm_page import alarm_page, alarm_strip
 from koopman_ros.panel.audit_page import audit_page
 from koopman_ros.panel.connections import BACKLOG, Listener, RateLimiter
-from koopman_ros.panel.layout import PageLayout, Source
+from koopman_ros.panel.layout import Frame, LOOPS, PageLayout, prefix_of, Source
 from koopman_ros.panel.login import AccessControl, add_login
+from koopman_ros.panel.loop_page import loop_page
 from koopman_ros.panel.model_page import model_page
 from koopman_ros.panel.origins import is_loopback, rejection
 from koopman_ros.panel.overview import overview
@@ -59,15 +60,16 @@ _PAGES: dict[str, Callable[[PageLayout], None]] = {
 class _AuthMiddleware:
     """Middleware that rejects requests of other origins, and those without a login."""
 
-    def __init__(self, app: Any, keeper: AccessControl, listener: Listener) -> None:
-        self._app, self._keeper, self._listener = app, keeper, listener
+    def __init__(self, app: Any, keeper: AccessControl, listener: Listener,
+                 pages: Collection[str]) -> None:
+        self._app, self._keeper, self._listener, self._pages = app, keeper, listener, pages
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         if scope['type'] not in ('http', 'websocket'):
             await self._app(scope, receive, send)
             return
         kind, path = scope['type'], scope['path']
-        page = kind == 'http' and path in _PAGES
+        page = kind == 'http' and path in self._pages
         session = self._keeper.session(scope, use=page)
         response = self._rejection(scope, page and scope['method'] == 'GET', session is not None)
         if response is not None and kind == 'websocket':
@@ -135,6 +137,7 @@ class PanelServer:
     """
     The web server of a panel, one per process.
 
+    :param loops: by namespace.
     :param users: file of users, empty for none.
     :param proxies: addresses and networks of trusted proxies, empty for none.
     :param command_timeout: s after which a press on a page is refused.
@@ -142,8 +145,9 @@ class PanelServer:
     :raises OSError: for an address in use.
     """
 
-    def __init__(self, source: Source, host: str, port: int, users: str, certificate: str,
-                 key: str, proxies: Sequence[str] = (), command_timeout: float = 5.0) -> None:
+    def __init__(self, loops: Mapping[str, Source], host: str, port: int, users: str,
+                 certificate: str, key: str, proxies: Sequence[str] = (),
+                 command_timeout: float = 5.0) -> None:
         try:
             found = Users.read(users) if users else None
         except OSError as error:
@@ -160,13 +164,19 @@ class PanelServer:
         for name in _LOGS:
             logging.getLogger(name).addFilter(seldom)
         app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
-        add_login(app, source, keeper)
-        _add_pictures(app, source)
-        for path, fill in _PAGES.items():
-            _add_page(path, fill, source, keeper)
+        # the pages of the only one need no name of it
+        sources = loops if len(loops) > 1 else dict(zip([''], loops.values(), strict=True))
+        pages = {'/', *(prefix_of(loop) + path for loop in sources for path in _PAGES)}
+        add_login(app, lambda: LOOPS if len(sources) > 1 else sources[''].title, pages, keeper)
+        for loop, source in sources.items():
+            _add_pictures(app, prefix_of(loop), source)
+            for path, fill in _PAGES.items():
+                _add_page(path, fill, sources, loop, keeper)
+        if len(sources) > 1:
+            _add_loop_page(sources, keeper)
         ui.run_with(app, title='panel', favicon='⚙', binding_refresh_interval=None,
                     show_welcome_message=False, tailwind=False, reconnect_timeout=10.0)
-        app.add_middleware(_AuthMiddleware, keeper=keeper, listener=self._socket)
+        app.add_middleware(_AuthMiddleware, keeper=keeper, listener=self._socket, pages=pages)
         _guard_sockets(keeper, command_timeout)
         # browsers send the cookies of a host to all its ports, and a proxy may serve several hosts
         machine = zlib.crc32(socket.gethostname().encode())
@@ -238,18 +248,26 @@ def _bound(host: str, port: int) -> Listener:
     return own
 
 
-def _add_page(path: str, fill: Callable[[PageLayout], None], source: Source, keeper: AccessControl
-              ) -> None:
-    @ui.page(path)
+def _add_loop_page(sources: Mapping[str, Source], keeper: AccessControl) -> None:
+    @ui.page('/')
     def build(request: Request) -> None:
-        page = PageLayout(source, keeper.visitor(request.scope), path)
+        page = Frame(sources, keeper.visitor(request.scope), '/', LOOPS, [*sources.values()])
+        loop_page(page)
+        page.run()
+
+
+def _add_page(path: str, fill: Callable[[PageLayout], None], sources: Mapping[str, Source],
+              loop: str, keeper: AccessControl) -> None:
+    @ui.page(prefix_of(loop) + path)
+    def build(request: Request) -> None:
+        page = PageLayout(sources, loop, keeper.visitor(request.scope), path)
         alarm_strip(page)
         fill(page)
         page.run()
 
 
-def _add_pictures(app: FastAPI, source: Source) -> None:
-    @app.get('/picture/{name}', response_model=None)
+def _add_pictures(app: FastAPI, prefix: str, source: Source) -> None:
+    @app.get(f'{prefix}/picture/{{name}}', response_model=None)
     def picture(name: str) -> Response:
         # a name, no path
         found = source.learning.picture(name)

@@ -83,8 +83,12 @@ class PanelParameters(SignalParameters):
     trainer: str = parameter(
         'trainer', 'Name of the trainer node.', read_only=True)
     title: str = parameter(
-        '', 'Title of all pages; empty: the namespace and the name of the plant.',
+        '', 'Title of all pages of the loop; empty: the namespace and the name of the plant.',
         read_only=True)
+    loops: tuple[str, ...] = parameter(
+        ('',), 'Namespaces of the loops that are shown, e.g. line_1/reactor_3; an empty name: the '
+        'namespace of the panel. Each has a node of the name of the panel, for its parameters; '
+        'those of the web server are of the panel itself.', read_only=True)
     host: str = parameter(
         '127.0.0.1', 'Address of the web server. Users are required unless it is a loopback '
                      'address.',

@@ -44,6 +44,22 @@ _SHOWN = 10  # loops that failed, in diagnostics; the log has them all
 _LEFT: list[object] = []
 
 
+def loop_namespace(name: str, where: str) -> str:
+    """
+    Return the full namespace of a loop.
+
+    :param where: the name is given, for the message.
+    :raises ConfigurationError: for an invalid name.
+    """
+    namespace = f'/{name.lstrip("/")}'
+    try:
+        validate_namespace(namespace)
+    except InvalidNamespaceException as error:
+        raise ConfigurationError(f'{where}: {name[:100]!r} is not a namespace '
+                                 f'({one_line(error)}): use e.g. line_1/reactor_3') from None
+    return namespace
+
+
 def read_loops(path: Path) -> tuple[str, ...]:
     """
     Read the namespaces of loops, one a line; blank lines and comments after # do not count.
@@ -55,12 +71,7 @@ def read_loops(path: Path) -> tuple[str, ...]:
     for number, line in enumerate(path.read_text(errors='replace').splitlines(), 1):
         if not (word := line.partition('#')[0].strip()):
             continue
-        namespace = f'/{word.lstrip("/")}'
-        try:
-            validate_namespace(namespace)
-        except InvalidNamespaceException as error:
-            raise ConfigurationError(f'{path}, line {number}: {word[:100]!r} is not a namespace '
-                                     f'({one_line(error)}): use e.g. line_1/reactor_3') from None
+        namespace = loop_namespace(word, f'{path}, line {number}')
         if namespace in lines:
             raise ConfigurationError(f'{path}, line {number}: {namespace} is also in line '
                                      f'{lines[namespace]}: each loop needs its own')

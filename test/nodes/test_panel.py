@@ -201,9 +201,10 @@ class Panel:
         monkeypatch.setattr(requests, 'TIMEOUT', TIMEOUT)
         # of the two one in the usual unit
         rclpy.init(args=['--ros-args', '-p', 'coolant_temperature.shown_unit:=degF'])
-        self.ros, self.node = ros, PanelNode()
+        self.ros, self.panel = ros, PanelNode()
+        (self.loop,) = self.panel.loops.values()
         self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.node)
+        self.executor.add_node(self.panel)
         self.over = threading.Event()
         self.thread = threading.Thread(target=self.spin)
         self.thread.start()
@@ -217,7 +218,7 @@ class Panel:
         return self.ros.wait_until(condition)
 
     def ask(self, what: str, name: str = '', number: Any = None) -> Answer:
-        future: Future[Answer] = self.node.request(Action('anna', what, name, number))
+        future: Future[Answer] = self.loop.request(Action('anna', what, name, number))
         self.wait(future.done)
         return future.result()
 
@@ -225,8 +226,8 @@ class Panel:
         self.over.set()
         self.thread.join()
         self.executor.shutdown()
-        self.node.complete()
-        self.node.destroy_node()
+        self.panel.complete()
+        self.panel.destroy_node()
         rclpy.shutdown()
 
 
@@ -268,18 +269,18 @@ def reports_are_whole(ros: Harness, reports: list[DiagnosticArray]) -> None:
 
 
 def asks_for_all_that_there_is(desk: Panel, controller: NodeProcess) -> None:
-    node, ros = desk.node, desk.ros
+    loop, ros = desk.loop, desk.ros
     actions: list[String] = ros.listen(String, topics.AUDIT_LOG)
-    (publisher,) = (one for one in node.publishers
+    (publisher,) = (one for one in desk.panel.publishers
                     if one.topic_name == f'/{topics.AUDIT_LOG}')
     # the trainer records them, too
     desk.wait(lambda: publisher.get_subscription_count() >= 2)
-    desk.wait(lambda: node.snapshot.mode == 'automatic' and not node.snapshot.silences
-              and len(node.snapshot.parameters.get(TRAINER, ())) > 20
-              and node.snapshot.states[0].training and math.isfinite(node.snapshot.time))
+    desk.wait(lambda: loop.snapshot.mode == 'automatic' and not loop.snapshot.silences
+              and len(loop.snapshot.parameters.get(TRAINER, ())) > 20
+              and loop.snapshot.states[0].training and math.isfinite(loop.snapshot.time))
     # a set-point that is accepted, and one that is not
     assert desk.ask('setpoint', reactor.TEMPERATURE, 46.0) == Answer(True, 'accepted')
-    desk.wait(lambda: node.snapshot.states[0].setpoint == pytest.approx(46.0))
+    desk.wait(lambda: loop.snapshot.states[0].setpoint == pytest.approx(46.0))
     rejected = desk.ask('setpoint', reactor.TEMPERATURE, 80.0)
     assert re.fullmatch(
         r'rejected: outside 31\.85 to 53\.85 degC, the trained range', str(rejected))
@@ -293,13 +294,13 @@ def asks_for_all_that_there_is(desk: Panel, controller: NodeProcess) -> None:
     assert desk.ask('manual', reactor.COOLANT_TEMPERATURE, 100.0) == Answer(
         True, 'limited to 89.6 °F')
     assert desk.ask('manual', reactor.COOLANT_TEMPERATURE, 68.0) == Answer(True, 'accepted')
-    desk.wait(lambda: node.snapshot.inputs[0].command == pytest.approx(68.0))
-    assert node.snapshot.mode == 'manual'
+    desk.wait(lambda: loop.snapshot.inputs[0].command == pytest.approx(68.0))
+    assert loop.snapshot.mode == 'manual'
     assert desk.ask('automatic', CONTROLLER, True).accepted
     assert 'not latched' in desk.ask('clear safe state', CONTROLLER).text
     # parameters
     assert desk.ask('parameters', CONTROLLER, {'coolant_temperature.max': 30.0}).accepted
-    desk.wait(lambda: node.snapshot.inputs[0].limits == pytest.approx((41.0, 86.0)))
+    desk.wait(lambda: loop.snapshot.inputs[0].limits == pytest.approx((41.0, 86.0)))
     rejected = desk.ask('parameters', CONTROLLER, {'coolant_temperature.max': 4.0})
     assert 'coolant_temperature.min = 5.0 degC must be below' in rejected.text
     # services of the trainer
@@ -309,9 +310,9 @@ def asks_for_all_that_there_is(desk: Panel, controller: NodeProcess) -> None:
     desk.wait(lambda: {
         ('set-point', 'temperature 45 → 46 °C by anna'), ('mode', 'automatic → manual by anna'),
         ('parameter', 'coolant_temperature.max: 32 → 30 by anna')} <= {
-        (mark.kind, mark.text) for mark in node.view.trends.marks(0.0, 1e12)})
+        (mark.kind, mark.text) for mark in loop.view.trends.marks(0.0, 1e12)})
     assert controller.stop() == 0
-    desk.wait(lambda: not node.count_publishers(topics.EVENT_LOG))
+    desk.wait(lambda: not desk.panel.count_publishers(topics.EVENT_LOG))
     assert desk.ask('setpoint', reactor.TEMPERATURE, 45.0) == Answer(
         False, 'the controller is not running: start it')
 

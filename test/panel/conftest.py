@@ -25,7 +25,7 @@ class Served:
     loop: Any = None
 
     def __init__(self, users: str) -> None:
-        self.server = PanelServer(self, '127.0.0.1', 0, users, '', '', [PROXY])
+        self.server = PanelServer({'/': self}, '127.0.0.1', 0, users, '', '', [PROXY])
         self.server.start()
 
     def __getattr__(self, name: str) -> Any:

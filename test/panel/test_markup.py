@@ -9,13 +9,14 @@ from concurrent.futures import Future
 from typing import Any
 
 from nicegui import Client, ui
-from nicegui.page import page
+from nicegui.page import page as ui_page
 import pytest
 import yaml
 
 from koopman_ros.panel.alarm_page import alarm_page, alarm_strip
 from koopman_ros.panel.audit_page import audit_page
-from koopman_ros.panel.layout import attribute, PageLayout, Visitor
+from koopman_ros.panel.layout import attribute, Frame, LOOPS, PageLayout, Visitor
+from koopman_ros.panel.loop_page import loop_page
 from koopman_ros.panel.model_page import model_page
 from koopman_ros.panel.overview import overview
 from koopman_ros.panel.requests import Answer, Role
@@ -33,7 +34,7 @@ TEXT_PROPS = {'alt', 'aria-label', 'data-parameter', 'data-signal', 'data-title'
 @pytest.fixture
 def client() -> Iterator[Client]:
     """Return a client without a browser."""
-    own = Client(page('/test'))
+    own = Client(ui_page('/test'))
     with own:
         yield own
     own.delete()
@@ -51,14 +52,19 @@ def keys_and_texts(value: Any) -> Iterator[tuple[str, Any]]:
 
 
 @pytest.mark.parametrize('role', Role)
-@pytest.mark.parametrize('path', PAGES)
+@pytest.mark.parametrize('path', [*PAGES, LOOPS])
 def test_hostile_texts_of_all_sources_stay_texts(
         client: Client, path: str, role: Role) -> None:
-    source = HostileSource()
-    layout = PageLayout(source, Visitor(TEXTS[0], lambda: role), path)
-    alarm_strip(layout)
-    PAGES[path](layout)
-    layout.update()
+    visitor = Visitor(TEXTS[0], lambda: role)
+    if path == LOOPS:
+        sources = {name: HostileSource() for name in ('/line_1', '/line_2')}
+        shown_page: Frame = Frame(sources, visitor, '/', LOOPS, [*sources.values()])
+        loop_page(shown_page)
+    else:
+        shown_page = layout = PageLayout({'': HostileSource()}, '', visitor, path)
+        alarm_strip(layout)
+        PAGES[path](layout)
+    shown_page.update()
     shown = 0
     for element in client.elements.values():
         assert CODE not in element.tag
@@ -82,7 +88,8 @@ def test_hostile_texts_of_all_sources_stay_texts(
 
 
 def test_chart_tooltips_escape_markup(client: Client) -> None:
-    trend_page(PageLayout(HostileSource(), Visitor('anna', lambda: Role.ENGINEER), '/trends'))
+    trend_page(PageLayout({'': HostileSource()}, '', Visitor('anna', lambda: Role.ENGINEER),
+                          '/trends'))
     (chart,) = (own for own in client.elements.values() if isinstance(own, ui.echart))
     assert chart.options['tooltip']['renderMode'] == 'richText'
 
@@ -90,7 +97,7 @@ def test_chart_tooltips_escape_markup(client: Client) -> None:
 def test_the_tasks_of_a_closed_page_end(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     source, waiting = HostileSource(), Future[Answer]()
     monkeypatch.setattr(source, 'request', lambda _: waiting)
-    layout = PageLayout(source, Visitor('anna', lambda: Role.ENGINEER), '/')
+    layout = PageLayout({'': source}, '', Visitor('anna', lambda: Role.ENGINEER), '/')
 
     async def closed() -> None:
         task = asyncio.ensure_future(layout.act('train'))

@@ -4,11 +4,12 @@
 """A loop all of whose texts are markup and code, as a source of the panel's pages."""
 
 from concurrent.futures import Future
+from dataclasses import replace
 import math
 
 from koopman_ros.panel.alarms import Priority
 from koopman_ros.panel.requests import Action, Answer
-from koopman_ros.panel.snapshot import CONTROLLER, ERROR, TRAINER
+from koopman_ros.panel.snapshot import CONTROLLER, ERROR, Snapshot, TRAINER
 from koopman_ros.panel.training_report import Learning, ReplayComparison, TrainingReport
 from koopman_ros.panel.view_model import LoopViewModel
 from koopman_ros.parameters.description import ParameterDescription
@@ -72,6 +73,15 @@ class HostileSource:
         self.title = TEXT
         self.snapshot = own.snapshot(NOW + 2.0)
         self.asked: list[Action] = []
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """A new one each time: a page without new ones counts its connection as lost."""
+        return replace(self._snapshot)
+
+    @snapshot.setter
+    def snapshot(self, snapshot: Snapshot) -> None:
+        self._snapshot = snapshot
 
     def request(self, action: Action) -> Future[Answer]:
         """Reject what an operator asks for, in words that are no better."""
