@@ -53,6 +53,7 @@ _FACTOR = rf'\(*(?:1|[^\W\d]\w*|[°%][^\W\d]*){_POWER}(?:\){_POWER})*'
 _UNIT = re.compile(rf'(?:{_FACTOR}(?: ?[*/] ?| ))*{_FACTOR}')
 _LONGEST = 60  # characters of a unit
 
+_PRINTED = re.compile(r'\bdeg(?=[CF]?\b)|\bpercent\b')
 _SHARES = {'percent': 1e-2, 'ppm': 1e-6}  # units of dimension one, by name
 
 
@@ -146,9 +147,9 @@ def unit_label(unit: str) -> str:
     return printed(display_unit(unit))
 
 
-def printed(unit: str) -> str:
-    """Return a unit as it is printed."""
-    return unit.replace('deg', '°')
+def printed(text: str) -> str:
+    """Return a unit, or the units in a text of a node or a file, as people write them."""
+    return _PRINTED.sub(lambda found: '°' if found[0] == 'deg' else '%', text)
 
 
 def shown(values: Numbers, unit: str) -> Numbers:

@@ -11,13 +11,13 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from importlib.resources import files
 import operator
-import re
 import time
 from typing import Any, Protocol, Self, TypeVar
 
 from nicegui import ui
 from nicegui.element import Element
 
+from koopman_ros.core.units import printed
 from koopman_ros.panel.alarms import Alarm, AlarmState, Priority
 from koopman_ros.panel.requests import Action, Answer, required_role, Role, UNKNOWN
 from koopman_ros.panel.snapshot import Snapshot
@@ -37,7 +37,6 @@ _SETTLED = 2.0  # s after which an answer no longer holds if the loop changes
 SOUNDS = {Priority.HIGH: '880', Priority.MEDIUM: '660', Priority.LOW: '440'}
 SYMBOLS = {Priority.HIGH: '■', Priority.MEDIUM: '▲', Priority.LOW: '●'}
 _ADDRESSES = ('href', 'src')
-_DEGREES = re.compile(r'\bdeg(?=[CF]\b)')
 _Kind = TypeVar('_Kind', bound=Element)
 NOT_ALLOWED = {role: Answer(False, f'for {role.value}s only: log in as {role.value}')
                for role in Role}
@@ -410,7 +409,7 @@ def card(title: str, name: str) -> Element:
 
 
 class _Label(ui.label):
-    """Text in an element of any tag, with the degrees of nodes and files as people write them."""
+    """Text in an element of any tag, with the units of nodes and files as people write them."""
 
     def __init__(self, tag: str, text: str) -> None:
         super().__init__()
@@ -418,7 +417,7 @@ class _Label(ui.label):
         self.set_text(text)
 
     def set_text(self, text: str) -> Self:
-        return super().set_text(_DEGREES.sub('°', text))
+        return super().set_text(printed(text))
 
 
 def label(tag: str, text: str, classes: str = '') -> ui.label:

@@ -15,7 +15,7 @@ import yaml
 
 from koopman_ros.panel.alarm_page import alarm_page, alarm_strip
 from koopman_ros.panel.audit_page import audit_page
-from koopman_ros.panel.layout import attribute, Frame, LOOPS, PageLayout, Visitor
+from koopman_ros.panel.layout import attribute, Frame, label, LOOPS, PageLayout, Visitor
 from koopman_ros.panel.loop_page import loop_page
 from koopman_ros.panel.model_page import model_page
 from koopman_ros.panel.overview import overview
@@ -108,6 +108,14 @@ def test_the_tasks_of_a_closed_page_end(client: Client, monkeypatch: pytest.Monk
 
     with pytest.raises(asyncio.CancelledError):
         asyncio.run(closed())
+
+
+@pytest.mark.parametrize(('text', 'shown'), [
+    ('valve: 0 percent is below 5 percent', 'valve: 0 % is below 5 %'),
+    ('limited to 32 degC', 'limited to 32 °C'), ('the percentage of degrees', None)])
+def test_units_are_written_as_people_write_them(
+        client: Client, text: str, shown: str | None) -> None:
+    assert label('div', text).text == (shown or text)
 
 
 @pytest.mark.parametrize('name', [':aria-label', 'onclick', 'style', 'class', 'innerHTML', 'a b'])
