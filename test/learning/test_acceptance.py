@@ -15,7 +15,7 @@ from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.paths import model_path
 from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest
 from koopman_ros.learning import compare_classes, Edmd, evaluate_model, learn_lift, Thresholds
-from koopman_ros.learning.acceptance import held_out, HeldOut, uncovered_setpoints
+from koopman_ros.learning.acceptance import decision, held_out, HeldOut, uncovered_setpoints
 from koopman_ros.learning.acceptance.plant_test import PlantTest
 from koopman_ros.learning.drift_sampling import _spread, drift_samples
 from koopman_ros.learning.ensemble import disagreement
@@ -254,6 +254,17 @@ def test_the_law_is_tried_on_alternative_drifts_and_on_plausible_plants(found, t
     assert reason.startswith('On 2 plants')
     (warning,) = decision.warnings
     assert '3 drifts that explain the record equally well differ by ' in warning
+
+
+@pytest.mark.usefixtures('no_loops')
+def test_a_drift_that_follows_no_part_of_the_record_is_rejected(found, trained, monkeypatch):
+    def fails(*_, **__):
+        raise ValueError('no part of the record')
+
+    monkeypatch.setattr(decision, 'correction_posterior', fails)
+    result = evaluate_model(found, trained, None, Thresholds())
+    assert 'no part of the record' in ' '.join(result.reasons)
+    assert result.statement == ''
 
 
 @pytest.mark.parametrize(('effect', 'accepted'), [

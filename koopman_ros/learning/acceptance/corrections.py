@@ -183,7 +183,8 @@ def correction_posterior(drift: Drift, own: OwnTerms, episodes: Sequence[Episode
     segments = Segments.of([parts[k] for k in np.sort(order[room])], longest_step(parts))
     pieces, followed = _linearised(drift, basis, segments, settings, offsets)
     if not pieces:
-        raise ValueError('the free runs of the estimated drift follow no part of the record')
+        raise ValueError('the free runs of the estimated drift follow no part of the record: '
+                         'record an input or a state that is missing')
     xi, v = _samples(drift, segments)
     sizes = np.sqrt(np.mean(drift.scaled_rate(xi, v) ** 2, axis=0))
     own_terms = basis.own(own)

@@ -12,7 +12,11 @@ import numpy as np
 from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest, LOOPS
 from koopman_ros.execution import Backend
-from koopman_ros.learning.acceptance.corrections import correction_posterior, OwnTerms
+from koopman_ros.learning.acceptance.corrections import (
+    correction_posterior,
+    CorrectionPosterior,
+    OwnTerms,
+)
 from koopman_ros.learning.acceptance.held_out import HeldOut
 from koopman_ros.learning.acceptance.held_range import held_shares, HeldShares
 from koopman_ros.learning.acceptance.missing_structure import missing_structure
@@ -111,8 +115,15 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
         reasons = (*filter(None, [worse]), *reasons)
     plant = None
     if not reasons:
-        plant = _plant_acceptance(held_out, found, model, thresholds, setpoints, watch, backend)
-        reasons = plant.reasons
+        try:
+            posterior = correction_posterior(drift, _own_terms(drift), found.episodes, thresholds,
+                                             offsets=len(found.offsets) > 0)
+        except (ValueError, np.linalg.LinAlgError) as error:
+            reasons = (f'the plants that the record allows cannot be found: {error}',)
+        else:
+            plant = _plant_acceptance(held_out, found, model, posterior, setpoints, watch,
+                                      backend)
+            reasons = plant.reasons
     points = operating_points(model, law_check.setpoints if plant is None else np.vstack([
         law_check.setpoints, plant.test.setpoints]))
     reasons = (*reasons, *filter(None, [unfounded_instability(
@@ -124,12 +135,10 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
 
 
 def _plant_acceptance(held_out: HeldOut, found: Identified, model: LiftedModel,
-                      settings: Thresholds, setpoints: Mapping[str, Sequence[float]],
+                      posterior: CorrectionPosterior, setpoints: Mapping[str, Sequence[float]],
                       watch: Callable[[float], bool], backend: Backend | None) -> PlantAcceptance:
     """Judge a model by the plants that the record cannot distinguish from the estimated one."""
-    drift, episodes = found.drift, found.episodes
-    posterior = correction_posterior(drift, _own_terms(drift), episodes, settings,
-                                     offsets=len(found.offsets) > 0)
+    drift, episodes, settings = found.drift, found.episodes, posterior.settings
     plants = posterior.draw(settings.plants)
     # other drifts of the identification are plausible plants, too
     others = found.alternatives[:settings.alternatives]

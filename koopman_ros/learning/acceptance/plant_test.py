@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.evaluation.closed_loop_settings import SETTINGS
-from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest, evaluate_closed_loops, Rate
+from koopman_ros.evaluation.closed_loop_test import evaluate_closed_loops, Rate
 from koopman_ros.execution import Backend, Serial
 from koopman_ros.learning.acceptance.settings import DEFAULTS, Thresholds
 from koopman_ros.learning.identification import Stopped
@@ -111,7 +111,9 @@ def run_plants(model: LiftedModel, rates: Sequence[Rate], conditions: LoopCondit
         stopped = watch(sum(done.values()) / len(done)) or stopped
         return stopped
 
-    failed, loops, setpoints = [], [], [np.zeros((0, model.n_x))]
+    failed: list[int] = []
+    loops: list[int] = []
+    setpoints = [np.zeros((0, model.n_x))]
     result = PlantTest(np.zeros(0, np.int64), np.zeros(0, np.int64), setpoints[0], settings)
     with contextlib.closing((backend or Serial()).run(
             _tested, items, shared=(model, conditions, settings), watch=watching)) as tests:
@@ -119,10 +121,9 @@ def run_plants(model: LiftedModel, rates: Sequence[Rate], conditions: LoopCondit
             if test is None:
                 raise Stopped
             done[name] = 1.0
-            # where no loop counts, the law has failed
-            failed.append(int(test.failed.sum()) if test.loops else 1)
-            loops.append(max(test.loops, 1))
-            setpoints.append(test.setpoints)
+            failed.append(test[0])
+            loops.append(test[1])
+            setpoints.append(test[2])
             result = PlantTest(np.array(failed), np.array(loops), np.vstack(setpoints), settings)
             if result.lost >= settings.lost_plants:
                 break
@@ -132,11 +133,20 @@ def run_plants(model: LiftedModel, rates: Sequence[Rate], conditions: LoopCondit
 
 
 def _tested(shared: tuple[LiftedModel, LoopConditions, Thresholds], item: tuple[Rate, int],
-            notify: Callable[[float], bool]) -> ClosedLoopTest | None:
-    """Close the loops of one plant, from starts of its own."""
+            notify: Callable[[float], bool]) -> tuple[int, int, Array] | None:
+    """Return the failed loops of one plant, all loops, and their set-points; None if stopped."""
     (model, conditions, settings), (rate, seed) = shared, item
-    return evaluate_closed_loops(
-        model, rate, loops=settings.plant_loops, seed=1 + seed, watch=notify,
-        interval=conditions.interval, noise=conditions.noise,
-        disturbances=conditions.disturbances, settings=replace(
-            SETTINGS, most_calls=settings.plant_calls, fewest_loops=settings.fewest_loops))
+    try:
+        # from starts of its own
+        test = evaluate_closed_loops(
+            model, rate, loops=settings.plant_loops, seed=1 + seed, watch=notify,
+            interval=conditions.interval, noise=conditions.noise,
+            disturbances=conditions.disturbances, settings=replace(
+                SETTINGS, most_calls=settings.plant_calls, fewest_loops=settings.fewest_loops))
+    except np.linalg.LinAlgError:
+        # no law stabilises its linearisation
+        return 1, 1, np.zeros((0, model.n_x))
+    if test is None:
+        return None
+    # where no loop counts, the law has failed
+    return (int(test.failed.sum()) if test.loops else 1), max(test.loops, 1), test.setpoints

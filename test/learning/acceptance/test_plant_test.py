@@ -69,6 +69,12 @@ def test_a_test_ends_when_enough_plants_are_lost():
     assert not found.accepted
 
 
+def test_a_plant_that_no_input_moves_is_lost():
+    found = run_plants(MODEL, [lambda x, u: x + 0.0 * u], CONDITIONS, Thresholds(plant_loops=4))
+    assert found.lost == 1
+    assert found.share == (1.0, 1.0)
+
+
 def test_a_test_stops_when_it_is_asked_to():
     shares = []
     with pytest.raises(Stopped):
