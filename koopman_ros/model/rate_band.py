@@ -19,8 +19,8 @@ class RateBand:
     """
     Rates of a drift along each state, with the band of the plants that a record allows.
 
-    Along a state, the other signals have their means of the samples near it, so that every point
-    is where the data are. All values are in scaled deviations and per time unit of the model.
+    Along a state, the other signals follow their linear regression on it, so that the points are
+    where the data are. All values are in scaled deviations and per time unit of the model.
 
     :raises ValueError: naming the array that does not fit.
     """

@@ -133,3 +133,5 @@ def test_figures_are_reported_for_each_signal() -> None:
     assert '1 m in low, 3 Pa in high' in words
     summary['heldout_error_of_current_model']['low'] = None
     assert 'infinite (diverges)' in training.outcome_text(summary)
+    said = {**summary, 'closed_loop_statement': 'On 30 plants'}
+    assert training.outcome_text(said).endswith('written to new. On 30 plants')

@@ -4,6 +4,7 @@
 """The files of a training and of a replay, and the words for a model."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import datetime
 import json
 import os
@@ -151,6 +152,10 @@ def test_a_model_is_described_in_words() -> None:
     assert found['Learned from'] == 'two tanks'
     assert {'Condition number', 'Held-out roll-out error (RMS), level 1 [m]'} <= set(found)
     assert not any('_' in name for name in found)
+    said = 'On 30 plants'
+    model = replace(model, provenance=replace(model.provenance, closed_loops=said))
+    assert model_card(model)['Closed loops'] == said
+    assert training_card({'closed_loop_statement': said}) == {'Closed loops': said}
     assert training_ranges(model)['level_1'] == (model.states.lower[0], model.states.upper[0])
     assert training_card({
         'accepted': 'False', 'done [%]': '100', 'heldout_rw': '1e-4', 'units: level_1': 'm',

@@ -29,11 +29,9 @@ def rate_band(drift: Drift, plants: Sequence[PlausiblePlant], x: Array, u: Array
     tail = 0.5 * (1.0 - settings.confidence)
     columns = []
     for i in range(x.shape[1]):
-        order = np.argsort(x[:, i], kind='stable')
-        trim = int(settings.trimmed * len(order))
-        groups = np.array_split(order[trim:len(order) - trim], min(
-            settings.band_points, len(order) - 2 * trim))
-        X, U = (np.array([np.mean(a[rows], axis=0) for rows in groups]) for a in (x, u))
+        ends = np.quantile(x[:, i], [settings.trimmed, 1.0 - settings.trimmed])
+        path = np.vander(np.linspace(*ends, settings.band_points), 2)
+        X, U = (path @ np.linalg.lstsq(np.vander(x[:, i], 2), a, rcond=None)[0] for a in (x, u))
         rates = drift.rate(X, U)[:, i]
         low, high = np.quantile([one.correction(X, U)[:, i] for one in plants],
                                 [tail, 1.0 - tail], axis=0)
