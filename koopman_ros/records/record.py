@@ -93,8 +93,10 @@ def read(source: Source, states: Names, inputs: Names, *, time: str = '', period
     Where both have a unit, values are converted to that of the argument. A signal without a unit
     has the unit 1. A cell without a number is a missing measurement of that signal alone: NaN in
     the episodes, so that a signal from the laboratory counts at its own times. An input without a
-    number keeps its last value. A new episode begins at a gap of 3.5 usual periods, where time is
-    set back, and where a state jumps as after a reset; spikes are dropped.
+    number keeps its last value. A column ``level_quality``, or ``quality`` for all, of texts or
+    codes of OPC, leaves out the values that are not good. A new episode begins at a gap of 3.5
+    usual periods, where time is set back, and where a state jumps as after a reset; spikes are
+    dropped.
 
     :param source: a text table (.csv, .txt, .tsv, .dat, .lvm), a .parquet or .mat file, a bag, a
         DataFrame, columns by name, or a list of them. Columns of a two-dimensional array y of a

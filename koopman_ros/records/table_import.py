@@ -75,6 +75,12 @@ def _values(table: Table, signal: SignalColumn, report: ImportReport, measured: 
     if k is None:
         raise table.missing(signal.column)
     values = table.numbers(k)
+    if (quality := table.bad_quality(k)) is not None:
+        header, bad = quality
+        if count := int(np.sum(bad & np.isfinite(values))):
+            report.note(f'{table.label}: {count} values of {signal.name} are left out, which are '
+                        f'not good by {header!r}')
+        values = np.where(bad, np.nan, values)
     missing = int(np.sum(np.isnan(values)))
     if missing == len(values):
         text = table.first_text(k)

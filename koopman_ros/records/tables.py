@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 import os
 from pathlib import Path
 import re
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.units import check_unit
@@ -154,6 +155,26 @@ class Table:
         return '.' if self.separator == ',' and not any(
             ',' in cell for k in self.frame.columns for cell in self.cells(k) or ()) else ''
 
+    def bad_quality(self, k: int) -> tuple[str, NDArray[np.bool_]] | None:
+        """
+        Return the header of the quality of a column, and where (R,) it is not good.
+
+        Good are texts that begin so, and the codes 192 to 255 of OPC. None where the column has no
+        quality, or one in other codes.
+        """
+        name = re.escape(name_and_unit(self.headers[k])[0].lower())
+        for other, header in enumerate(self.headers):
+            if other == k or not re.fullmatch(
+                    rf'({name})?[\s_./:-]*quality', header.strip().lower()):
+                continue
+            if self._has_numbers(other):
+                codes = self.numbers(other)
+                good = (codes // 64 == 3.0) & ~np.any(codes % 1.0 > 0.0)
+            else:
+                good = np.char.startswith(np.char.lower(self.cells(other) or ['']), 'good')
+            return (header, ~good) if good.any() else None
+        return None
+
     def first_text(self, k: int) -> str:
         """Return the first cell that is not empty, as a text in quotes, or nothing."""
         return next((repr(text[:40]) for text in map(str, self.frame[k].dropna()) if text), '')
@@ -258,6 +279,8 @@ class Table:
             return period * np.arange(len(self.frame), dtype=np.float64)
         k, unit = self.time_column(time)
         column, cells, label = self.frame[k], self.cells(k), self.headers[k]
+        in_seconds = partial(number_seconds, unit=unit, name=label,
+                             note=lambda text: note(f'{self.label}: {text}'))
         if not self.first_text(k):
             raise ValueError(f'{self.label}: the column {label!r} holds no times: name another '
                              'one')
@@ -267,17 +290,16 @@ class Table:
         try:
             if cells is None:
                 whole = column.dtype.kind in 'iu'
-                return number_seconds(column.to_numpy(
-                    np.int64 if whole else np.float64, **({} if whole else {'na_value': np.nan})
-                    ), unit, label)
+                return in_seconds(column.to_numpy(
+                    np.int64 if whole else np.float64, **({} if whole else {'na_value': np.nan})))
             if all(cell.isdecimal() and len(cell) < 19 for cell in cells):
-                return number_seconds(np.array(cells, dtype=np.int64), unit, label)
+                return in_seconds(np.array(cells, dtype=np.int64))
             mostly = [bool(re.match(r"[-+]?[.,]?\d[\d.,' ]*([eE][-+]?\d+)?$", cell))
                       and not re.match(r'\d+\.\d+\.\d', cell) for cell in cells]
             if 2 * sum(mostly) > len(cells):
-                return number_seconds(numbers(
+                return in_seconds(numbers(
                     [cell if number else '' for cell, number in zip(cells, mostly, strict=True)],
-                    self._decimal_mark), unit, label)
+                    self._decimal_mark))
             return text_seconds(cells, label, dayfirst)
         except CellError as error:
             raise ValueError(f'{self.label}, row {self.frame.index[error.row]}, column {label!r}: '

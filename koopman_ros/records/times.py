@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 import re
 from typing import Any
@@ -39,12 +39,14 @@ class TimeRules:
     unreadable: float = 0.05
 
 
-def number_seconds(numbers: Any, unit: str, name: str, rules: TimeRules = TimeRules()) -> Array:
+def number_seconds(numbers: Any, unit: str, name: str, note: Callable[[str], None],
+                   rules: TimeRules = TimeRules()) -> Array:
     """
     Return times (R,) in s since the first one.
 
     :param numbers: (R,) floats, or integers where all digits of an epoch count.
     :param unit: of the numbers; empty where it is not known.
+    :param note: called with the assumption that they are seconds.
     :raises ValueError: for numbers that may be something else, with what to write.
     """
     finite = numbers[np.isfinite(numbers)]
@@ -71,6 +73,8 @@ def number_seconds(numbers: Any, unit: str, name: str, rules: TimeRules = TimeRu
     if high - low >= rules.longest or max(abs(low), abs(high)) > rules.epoch[1]:
         raise ValueError(f'the times in {name!r} go from {first} to {high:.6g}, which cannot be '
                          f'seconds: {advice}')
+    note(f"the times in {name!r} have no unit, s is assumed: write time='{name} [s]', or [ms], "
+         '[min]')
     return since
 
 

@@ -274,6 +274,28 @@ def test_a_period_beside_a_column_of_times_is_a_notice():
                for note in record.report.notes)
 
 
+@pytest.mark.parametrize(('quality', 'left_out'), [
+    (np.where(np.arange(N) == 7, 'Bad', 'Good, local'), 1),
+    (np.where(np.arange(N) == 7, 24, 192), 1),
+    # of other codes, or a signal
+    (np.zeros(N), 0), (np.full(N, 200.5), 0)])
+@pytest.mark.parametrize('header', ['level_quality', 'Quality'])
+def test_values_that_are_not_good_are_left_out(quality, left_out, header):
+    table = frame(time=SECONDS).assign(**{header: quality})
+    table.loc[7, 'level [m]'] = 1.2
+    record = read(table, 'level', 'pump')
+    assert record.report.used == N - left_out
+    assert any(np.any(one.x == 1.2) for one in record.episodes) != bool(left_out)
+    assert any(header in note for note in record.report.notes) == bool(left_out)
+
+
+@pytest.mark.parametrize(('options', 'said'), [
+    ({}, True), ({'time': 'time [s]'}, False), ({'period': 0.5}, False)])
+def test_times_without_a_unit_are_taken_as_seconds_with_a_notice(options, said):
+    record = read(frame(time=SECONDS), 'level', 'pump', **options)
+    assert any("time='time [s]'" in note for note in record.report.notes) == said
+
+
 @pytest.mark.parametrize(('dayfirst', 'step'), [
     (None, None), (True, 86400.0), (False, 31 * 86400.0)])
 def test_days_and_months_that_no_date_tells_are_asked_for(dayfirst, step):
