@@ -222,7 +222,11 @@ class PanelLoop:
     # Messages.
 
     def _on_signal(self, kind: str, sample: SignalSample) -> None:
-        self.view.take_signals(kind, sample.values, sample.stamp_ns / NANOSECONDS, time.time())
+        now = time.time()
+        self.view.take_signals(kind, sample.values, sample.stamp_ns / NANOSECONDS, now)
+        if kind == 'active_setpoints':
+            # the effect of an entry is shown without a wait for the timer
+            self.snapshot = self.view.snapshot(now)
 
     def _on_internals(self, message: JointState) -> None:
         self.view.take_internals(dict(zip(message.name, message.position, strict=False)))
@@ -315,6 +319,7 @@ class PanelLoop:
         word = 'accepted' if answer.accepted else 'rejected'
         value = sanitize_text(f'{action.name} {action.value}', _LOGGED)
         self.node.get_logger().info(f'{action.who}: {action.what} {value}: {word}')
+        self.snapshot = self.view.snapshot(time.time())
         if not future.done():
             future.set_result(answer)
 

@@ -24,7 +24,7 @@ from koopman_ros.panel.snapshot import Snapshot
 from koopman_ros.panel.training_report import Learning
 from koopman_ros.panel.view_model import LoopViewModel
 
-PERIOD = 0.25  # s between two updates of a page
+PERIOD = 0.1  # s between two looks for a new snapshot
 _TIMEOUT = 40.0  # s for an answer
 TABS = {'/': 'Overview', '/trends': 'Trends', '/alarms': 'Alarms', '/model': 'Model',
         '/tuning': 'Tuning', '/audit': 'Audit'}
