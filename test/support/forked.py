@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Start nodes by forking a process that has imported them: their imports take most of a start."""
+"""Start nodes by forking a process that has imported most of what they import, half of a start."""
 
 from collections.abc import Mapping, Sequence
 import contextlib
@@ -18,10 +18,11 @@ from koopman_ros import process_entry
 
 _CHILD = process_entry.command('', signal.SIGINT, 0)[:3]
 _CONTEXT = multiprocessing.get_context('forkserver')
-# Modules alone, no participant, file or thread: what a node sets up it sets up after the fork.
+# Not rclpy: its import starts threads of the middleware, which a fork would not have.
 _CONTEXT.set_forkserver_preload([
-    'rosidl_generator_py', *(f'koopman_ros.nodes.{name}' for name in (
-        'plant', 'controller', 'trainer', 'player', 'replay'))])
+    'rosidl_generator_py', 'yaml', 'asyncio', *(f'koopman_ros.{name}' for name in (
+        'control', 'evaluation', 'event_log.run', 'parameters.controller', 'parameters.player',
+        'parameters.trainer', 'parameters.model_checks', 'plants.catalogue', 'records'))])
 
 
 class ForkedProcess:
