@@ -24,6 +24,7 @@ from koopman_ros.learning.lift.levenberg_marquardt import MinimumStatus
 from koopman_ros.learning.lift.metrics import evaluate, LiftMetrics, ROUNDING
 from koopman_ros.learning.lift.multistart import MultistartProgress, Recipe, Watch
 from koopman_ros.learning.lift.neural_drift import NeuralDrift, with_readout, with_units_of
+from koopman_ros.learning.lift.reference_drift import CorrectedRate
 from koopman_ros.learning.lift.training import PreparedSamples, train, TrainingFailed
 from koopman_ros.model import LiftedModel, model_file
 from koopman_ros.model_classes import FREE_LIFT, IDENTITY_LIFT, LINEAR, NEURAL_DRIFT, POLYNOMIAL
@@ -306,11 +307,14 @@ def _judge(prepared: PreparedSamples, loops: int, backend: Backend | None) -> Ju
         model = one.model
         if not loops or model is None or not model.n_u:
             return one
-        law_check = evaluate_closed_loops(model, prepared.reference_drift(model), loops=loops,
+        reference = prepared.reference_drift(model)
+        law_check = evaluate_closed_loops(model, reference, loops=loops,
                                           backend=backend,
                                           disturbances=prepared.plant.disturbance_names)
         rejected = law_check is not None and not law_check.accepted
+        cause = reference.cause if isinstance(reference, CorrectedRate) else ''
         return replace(one, law_check=law_check,
-                       rejection=f'does not control the plant: {law_check}' if rejected else '')
+                       rejection=f'does not control the plant: {law_check}{cause}' if rejected
+                       else '')
 
     return Judge(judged, ROUNDING)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.control import Controller, Tuning
-from koopman_ros.core.datasets import split_by_episode
+from koopman_ros.core.datasets import DriftSamples, PlantDescription, split_by_episode
 from koopman_ros.evaluation.closed_loop_test import evaluate_closed_loops
 from koopman_ros.learning import (
     compare,
@@ -75,6 +75,22 @@ def test_swapped_arguments_are_named(swapped):
 def bent():
     """Compare the models of the bent plant, whose drift is of degree 2."""
     return compare(BENT, bent_samples(), RECIPES, starts=1, loops=16)
+
+
+@pytest.mark.parametrize(('effect', 'accepted'), [
+    (lambda u: u, True), (lambda u: np.sign(u) * np.maximum(np.abs(u) - 0.5, 0.0), False)])
+def test_a_law_is_tried_on_inputs_that_act_nonlinearly(effect, accepted):
+    """Exact rates of a pendulum whose actuator has a dead zone."""
+    rng = np.random.default_rng(0)
+    x, u = rng.uniform(-1.5, 1.5, (900, 2)), rng.uniform(-1.4, 1.4, (900, 1))
+    rate = np.column_stack([x[:, 1], effect(u[:, 0]) - np.sin(x[:, 0]) - 0.5 * x[:, 1]])
+    plant = PlantDescription('pendulum', ('angle', 'speed'), ('rad', 'rad/s'), ('torque',),
+                             ('N m',), 's', np.zeros(2), np.zeros(1), None)
+    samples = DriftSamples(x, rate, u, np.arange(900) % 9)
+    found = compare(plant, samples, {}, loops=16)
+    polynomial = found.contenders[1]
+    assert (not polynomial.rejection) is accepted
+    assert accepted or 'the effect of torque is nonlinear' in polynomial.rejection
 
 
 def test_a_polynomial_drift_is_found_and_taken(bent):

@@ -18,7 +18,6 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import Array, short_repr
@@ -27,6 +26,7 @@ from koopman_ros.core.integration import runge_kutta_step, sensitivity_rate
 from koopman_ros.learning.acceptance.settings import DEFAULTS, Thresholds
 from koopman_ros.learning.identification import Drift, fitted_starts, longest_step, Segments
 from koopman_ros.learning.identification.drift import prediction_error
+from koopman_ros.learning.legendre_basis import LegendreBasis
 
 
 class OwnTerms(NamedTuple):
@@ -35,55 +35,11 @@ class OwnTerms(NamedTuple):
     degree: int  #: of the terms in x alone
     input_degree: int  #: of the factors in x of terms linear in u; -1 for none
 
-
-@dataclass(frozen=True)
-class LegendreBasis:
-    """Products of normalised Legendre polynomials in scaled deviations of states and inputs."""
-
-    exponents: NDArray[np.int64]  #: (p, n_x + n_u) degree of each factor
-    n_x: int
-    edge: float  #: deviations beyond count as this one
-
-    __repr__ = short_repr
-
-    @classmethod
-    def of(cls, n_x: int, n_u: int, settings: Thresholds, least: int) -> LegendreBasis:
-        """Return those up to the degree of the settings, or `least`, that are few enough."""
-        degree = max(settings.degree_of_one_state if n_x == 1 else settings.degree, least)
-        while True:
-            exponents = np.array(_exponents(n_x + n_u, degree))
-            if degree == 1 or n_x * len(exponents) <= settings.most_coefficients:
-                return cls(exponents, n_x, settings.edge)
-            degree -= 1
-
-    def __call__(self, xi: Array, v: Array) -> Array:
-        """Evaluate the products: (..., n_x) and (..., n_u) -> (..., p)."""
-        y = np.clip(np.concatenate((xi, v), axis=-1), -self.edge, self.edge)
-        top = int(self.exponents.max())
-        # orthonormal for a uniform distribution on [-1, 1]
-        each = legvander(y, top) * np.sqrt(2.0 * np.arange(top + 1) + 1.0)
-        found: Array = each[..., 0, self.exponents[:, 0]]
-        for j in range(1, y.shape[-1]):
-            found = found * each[..., j, self.exponents[:, j]]
-        return found
-
-    @property
-    def degrees(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Degree of each product in the states (p,), and in the inputs (p,)."""
-        return (self.exponents[:, :self.n_x].sum(axis=1), self.exponents[:, self.n_x:].sum(axis=1))
-
-    def own(self, terms: OwnTerms) -> NDArray[np.bool_]:
-        """Return which products (p,) a drift has itself."""
-        of_x, of_u = self.degrees
-        return ((of_u == 0) & (of_x <= terms.degree)) | (
-            (of_u == 1) & (of_x <= terms.input_degree))
-
-
-def _exponents(count: int, degree: int) -> Sequence[tuple[int, ...]]:
-    """Return all exponents of `count` factors up to a total degree, the constant first."""
-    if count == 1:
-        return [(k,) for k in range(degree + 1)]
-    return [(k, *rest) for k in range(degree + 1) for rest in _exponents(count - 1, degree - k)]
+    def among(self, basis: LegendreBasis) -> NDArray[np.bool_]:
+        """Return which products (p,) of a basis a drift has itself."""
+        of_x, of_u = basis.degrees
+        return ((of_u == 0) & (of_x <= self.degree)) | (
+            (of_u == 1) & (of_x <= self.input_degree))
 
 
 @dataclass(frozen=True)
@@ -173,7 +129,9 @@ def correction_posterior(drift: Drift, own: OwnTerms, episodes: Sequence[Episode
     """
     box = drift.box
     n = len(box.states)
-    basis = LegendreBasis.of(n, len(box.inputs), settings, 1 + own.degree)
+    degree = settings.degree_of_one_state if n == 1 else settings.degree
+    basis = LegendreBasis.of(n, len(box.inputs), max(degree, 1 + own.degree),
+                             settings.most_coefficients)
     parts = _pieces(drift, episodes, settings)
     width = n * len(basis.exponents)
     per_sample = n * (width + n)
@@ -187,7 +145,7 @@ def correction_posterior(drift: Drift, own: OwnTerms, episodes: Sequence[Episode
                          'record an input or a state that is missing')
     xi, v = _samples(drift, segments)
     sizes = np.sqrt(np.mean(drift.scaled_rate(xi, v) ** 2, axis=0))
-    own_terms = basis.own(own)
+    own_terms = own.among(basis)
     deviations = _prior(basis, own_terms, sizes, settings)
     sigma = np.sqrt(np.array([np.mean(np.concatenate([one.residuals[i] for one in pieces]) ** 2)
                               if any(len(one.residuals[i]) for one in pieces) else 1.0

@@ -29,13 +29,13 @@ def rate_band(drift: Drift, plants: Sequence[PlausiblePlant], x: Array, u: Array
     tail = 0.5 * (1.0 - settings.confidence)
     columns = []
     for i in range(x.shape[1]):
-        ends = np.quantile(x[:, i], [settings.trimmed, 1.0 - settings.trimmed])
-        path = np.vander(np.linspace(*ends, settings.band_points), 2)
+        low, high = np.quantile(x[:, i], [settings.trimmed, 1.0 - settings.trimmed])
+        path = np.vander(np.linspace(low, high, settings.band_points), 2)
         X, U = (path @ np.linalg.lstsq(np.vander(x[:, i], 2), a, rcond=None)[0] for a in (x, u))
         rates = drift.rate(X, U)[:, i]
-        low, high = np.quantile([one.correction(X, U)[:, i] for one in plants],
-                                [tail, 1.0 - tail], axis=0)
-        columns.append((X[:, i], rates, rates + low, rates + high))
+        below, above = np.quantile([one.correction(X, U)[:, i] for one in plants],
+                                   [tail, 1.0 - tail], axis=0)
+        columns.append((X[:, i], rates, rates + below, rates + above))
     values, *bands = (np.column_stack(some) for some in zip(*columns, strict=True))
     return RateBand(error / states.scale, states.to_deviation(values),
                     *(one / states.scale for one in bands))

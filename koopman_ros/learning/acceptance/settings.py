@@ -36,7 +36,6 @@ class Thresholds:
     most_coefficients: int = 400  #: of all corrections; the degree is reduced to so many
     #: numbers of the sensitivities in memory (8 bytes each); of a longer record some segments
     most_numbers: int = 20_000_000
-    edge: float = 1.05  #: scaled deviation at which corrections end as constants, just outside
     #: prior deviation of the drift's own terms, in units of its rate: flat, the usual covariance
     own_deviation: float = 3.0
     #: prior deviations of the other terms: tau q^(degree - 2), integrated over a grid of tau from

@@ -37,6 +37,7 @@ from koopman_ros.learning.lift.metrics import (
 )
 from koopman_ros.learning.lift.multistart import Recipe, run_starts, Tracker, Watch
 from koopman_ros.learning.lift.neural_drift import SMALLEST, with_readout
+from koopman_ros.learning.lift.reference_drift import corrected, CorrectedRate
 from koopman_ros.learning.lift.scaling import Scaling
 from koopman_ros.model import Box, LiftedModel, Provenance, TrainingStates
 
@@ -109,6 +110,7 @@ class PreparedSamples:
 
         Polynomials, which share nothing with the lift but its samples, or the lift's own drift
         where it is better than all of them: errors of the polynomials should not count against it.
+        If it lacks much, it is corrected, so that no law is tried on a drift that is only affine.
         """
         training, validation, _ = self.parts
         candidates = [model]
@@ -119,7 +121,7 @@ class PreparedSamples:
         rates = [lifted_rate(one, one.seconds_per_time_unit) for one in candidates]
         errors = [float(np.sum(((rate(validation.x, validation.u) - validation.dxdt)
                                 / self.box.states.scale) ** 2)) for rate in rates]
-        return rates[int(np.argmin(errors))]
+        return corrected(rates[int(np.argmin(errors))], self.box, training, validation)
 
 
 @dataclass(frozen=True)
@@ -279,13 +281,16 @@ def _conclude(prepared: PreparedSamples, path: list[_Candidate], interrupted: bo
         # one that was ended before gets its loops all the same
         watch = (lambda _: False) if tracker.stop else tracker.check
         with contextlib.suppress(KeyboardInterrupt):
+            reference = prepared.reference_drift(winner.model)
             law_check = evaluate_closed_loops(
-                winner.model, prepared.reference_drift(winner.model), loops=loops, watch=watch,
-                backend=backend, disturbances=prepared.plant.disturbance_names)
+                winner.model, reference, loops=loops, watch=watch, backend=backend,
+                disturbances=prepared.plant.disturbance_names)
         interrupted = interrupted or law_check is None
         if law_check is not None and not law_check.accepted:
             raise TrainingFailed(f'the lift with n_z = {winner.model.n_z} does not control the '
-                                 f'plant: {law_check}: use {_remedies(winner.model)}')
+                                 f'plant: {law_check}: use {_remedies(winner.model)}'
+                                 + (reference.cause if isinstance(reference, CorrectedRate)
+                                    else ''))
     models, figures = [], []
     for candidate in path:
         figures.append(evaluate(candidate.model, test))
