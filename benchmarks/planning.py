@@ -18,8 +18,8 @@ from koopman_ros.control.mpc import RecedingHorizon
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import Estimate
-from koopman_ros.evaluation import at, simulate
-from koopman_ros.evaluation.simulate import after_a_second
+from koopman_ros.evaluation import at, run_loop
+from koopman_ros.evaluation.loop import after_a_second
 from koopman_ros.plants import Process
 from studies.equations import EQUATIONS
 from studies.partly_measured.cases import CASES, PartialCase
@@ -104,7 +104,7 @@ def _course(case: PartialCase, controller: Controller, samples: int
     """Let the controller lead the true plant; return calls, commands, set-points by sample."""
     wanted = SETPOINTS[case.plant]
     requested = {k: np.array(wanted[k // _HELD % len(wanted)]) for k in range(0, samples, _HELD)}
-    loop = simulate(controller, Process(case.system, 0, *case.start), [
+    loop = run_loop(controller, Process(case.system, 0, *case.start), [
         at(k * case.period, SetpointRequest(0, value)) for k, value in requested.items()],
         duration=(samples - 1) * case.period, period=case.period,
         noise=np.array(_NOISE[case.plant]))

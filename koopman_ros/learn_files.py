@@ -14,7 +14,6 @@ import sys
 from typing import Any
 
 from koopman_ros import __version__
-from koopman_ros.core.message_fields import place
 from koopman_ros.core.paths import model_path
 from koopman_ros.execution.training import (
     class_lines,
@@ -29,7 +28,7 @@ from koopman_ros.parameters.signal_topics import described, Signals
 from koopman_ros.parameters.table import ParameterTable
 from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.parameters.trainer_table import trainer_table
-from koopman_ros.records import read, Record, RecordedInput, RecordedState
+from koopman_ros.records import read, Record
 
 # Parameters of the trainer that are options here, by the same names.
 _OPTIONS = (
@@ -84,6 +83,11 @@ def command_parser() -> argparse.ArgumentParser:
         help='inputs that are linear from row to row; others are held')
     add('--lag', nargs='+', default=(), metavar='INPUT=S', help='time constants with which inputs '
         'follow their commands, in s; -1: found from a record of all states')
+    add('--dead_time', nargs='+', default=(), metavar='INPUT=S', help='dead times of inputs, in '
+        's; of those not named it is found')
+    add('--characteristic', nargs='+', default=(), metavar='INPUT=VALUE:EFFECT,...',
+        help='static characteristics of inputs, as points; two points: it acts linearly; of those '
+        'not named it is found')
     add('--as-state', nargs='+', default=(), metavar='INPUT', help='inputs that do not act '
         'linearly: their commands are states of the model, whose rates the laws set')
     add('--test', nargs='+', default=(), metavar='FILE', help='record of the same signals to test '
@@ -102,6 +106,15 @@ def command_parser() -> argparse.ArgumentParser:
                 f'{row.description}{f" [{row.unit}]" if row.unit else ""}'
                 f'{f" ({notes})" if notes else ""}').replace('%', '%%'))
     return parser
+
+
+def _next(file: str, accepted: bool) -> str:
+    """Say what can be done with a model."""
+    if not accepted:
+        return ('change the record or the options as the reasons say; '
+                'docs/how-to/tune_training.md explains each')
+    return (f"control by load('{file}') in Python (docs/tutorials/without_ros.md) or by the node "
+            f'(-p model:={file}), or write C code (python -m koopman_ros export_c {file})')
 
 
 def _loaded(model: str) -> LiftedModel | None:
@@ -128,18 +141,29 @@ def _table(present: LiftedModel | None, states: tuple[str, ...], inputs: tuple[s
         'disturbances_measured': disturbances})
 
 
-def _lags(texts: Sequence[str]) -> dict[str, float]:
+def _seconds(option: str, texts: Sequence[str]) -> dict[str, float]:
     try:
         return {name: float(seconds) for name, seconds in (one.split('=') for one in texts)}
     except ValueError:
-        raise ValueError(f'--lag {" ".join(texts)} must be inputs with a time constant in s each, '
-                         'as in pump=5') from None
+        raise ValueError(f'--{option} {" ".join(texts)} must be inputs with a time in s each, as '
+                         'in pump=5') from None
+
+
+def _points(texts: Sequence[str]) -> dict[str, tuple[float, ...]]:
+    try:
+        pairs = {name: [point.split(':') for point in points.split(',')]
+                 for name, points in (one.split('=') for one in texts)}
+        return {name: tuple(float(number) for value, effect in points for number in (
+            value, effect)) for name, points in pairs.items()}
+    except ValueError:
+        raise ValueError(f'--characteristic {" ".join(texts)} must be inputs with points, as in '
+                         'valve=0:0,50:20,100:90') from None
 
 
 def _learned(options: Mapping[str, Any], present: LiftedModel | None, record: Record, n_u: int,
              test: Record | None) -> int:
     # not before it is clear that there is something to learn: torch takes seconds
-    from koopman_ros.learning import retrain, TrainingTask
+    from koopman_ros.learning import learn
     from koopman_ros.learning.report import reported
 
     about = record.plant
@@ -155,33 +179,29 @@ def _learned(options: Mapping[str, Any], present: LiftedModel | None, record: Re
         **_DEFAULTS, 'model_output': f'{about.name}.safetensors', **given})
     if reason := table.check(settings):
         raise ValueError(reason)
-    # tables have no topics: those that the names would usually have stand for them
-    task = TrainingTask(
-        bags=record.sources, output=settings.model_output, plant=about.name,
-        model=str(model_path(settings.model)) if settings.model else '',
-        warm_start_model=(str(model_path(settings.warm_start_model))
-                          if settings.warm_start_model else ''),
-        states=tuple(RecordedState(name, unit, place(name, name, unit))
-                     for name, unit in signals.states.items()),
-        inputs=tuple(RecordedInput(name, unit, place(name, name, unit))
-                     for name, unit in acting.items()),
-        **{**settings.training(signals), 'lag': _lags(options['lag']),
-           'as_state': tuple(options['as_state'])})
     progress = TrainingProgress(lambda text: print(text, file=sys.stderr, flush=True))
 
     def on_progress(share: float, text: str) -> bool:
         progress.show(JobState(share, text))
         return False
 
-    retrained = retrain(task, on_progress, record=record, test=test)
+    result = learn(record, test=test, on_progress=on_progress, **{
+        **settings.training(signals), 'lag': _seconds('lag', options['lag']),
+        'dead_time': _seconds('dead_time', options['dead_time']),
+        'characteristics': _points(options['characteristic']),
+        'as_state': tuple(options['as_state']), 'output': settings.model_output,
+        **{name: str(model_path(file)) for name in ('model', 'warm_start_model')
+           if (file := getattr(settings, name))}})
     progress.show(JobState(1.0, ended=True))
-    summary, files = reported(retrained)
+    summary, files = reported(result)
     print(outcome_text(summary))
     for name, line in {**class_lines(summary), **constant_lines(summary)}.items():
         print(f'{name}: {line}')
     for warning in summary['warnings']:
         print(f'warning: {warning}')
-    for name, run in retrained.free_runs.items():
+    for name, run in result.free_runs.items():
         print(f'{name}: {run}')
     print('report: ' + ', '.join(files))
-    return 0 if retrained.accepted else 2
+    print(f'{summary["found"]}: {"accepted" if result.accepted else "rejected"}')
+    print(f'next: {_next(summary["model_file"], result.accepted)}')
+    return 0 if result.accepted else 2

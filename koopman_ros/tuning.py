@@ -236,10 +236,11 @@ class Tuning:
             name: for_signals(own, signals) for name, own in self.plugins.items()})
         if not np.any(made.state_weight > 0.0):
             raise ValueError('state_weight must not be 0 for all states')
-        for limits, kind in ((made.limits, 'input'), (made.sensor, 'sensor'),
-                             (made.disturbances, 'disturbance')):
+        for limits, kind, names in ((made.limits, 'input', inputs), (
+                made.sensor, 'sensor', measured), (
+                made.disturbances, 'disturbance', model.disturbances.names)):
             if not np.all(limits.lower < limits.upper):
-                raise ValueError(f'{kind} limits must be lower < upper, got '
+                raise ValueError(f'{kind} limits of {", ".join(names)} must be lower < upper, got '
                                  f'{limits.lower.tolist()} and {limits.upper.tolist()}')
         if not np.all(np.isfinite(made.safe_value)):
             raise ValueError(f'safe_value must be finite, got {made.safe_value.tolist()}')

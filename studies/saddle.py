@@ -20,7 +20,7 @@ from koopman_ros.control import Controller, Initialisation, InputLimits, Setpoin
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.plots import table
 from koopman_ros.core.signals import Outputs
-from koopman_ros.evaluation import at, simulate
+from koopman_ros.evaluation import at, run_loop
 from koopman_ros.execution import Backend, backend_of
 from koopman_ros.model import LiftedModel
 from koopman_ros.plants import ControlAffineSystem, Process, steady_state, two_state_reactor
@@ -101,7 +101,7 @@ def run(one: Controller, seed: int, period: float = 1.0) -> RunFigures:
     """Take the temperature along its course, and let the jacket foul."""
     x0, u0 = steady(COURSE[0.0])
     fouled = reactor(FOULING)
-    loop = simulate(one, Process(SYSTEM, 0, x0, u0), [
+    loop = run_loop(one, Process(SYSTEM, 0, x0, u0), [
         at(0.0, Initialisation(u0)), at(FOULED, on_plant(system=fouled)),
         *(at(when, SetpointRequest(0, np.array([value]))) for when, value in COURSE.items())],
         duration=END, period=period, noise=_noise(one.measured.all_states), seed=seed)

@@ -32,8 +32,8 @@ from koopman_ros.demo.console import LiveTable, read_options, run_demo
 from koopman_ros.demo.loop import FIRST_STAMP_NS, Operator, Row, running_loop, Scenario
 from koopman_ros.demo.reactor import constant
 from koopman_ros.demo.results import draw_phases
-from koopman_ros.evaluation import at, simulate
-from koopman_ros.evaluation.simulate import after_a_second, Simulation
+from koopman_ros.evaluation import at, run_loop
+from koopman_ros.evaluation.loop import after_a_second, LoopRun
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, load, Provenance, save
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.trainer import SETPOINT
@@ -278,9 +278,9 @@ def _figures(run: _Run, model: LiftedModel, begin: float) -> dict[str, float | b
     u0, fouled = run.commands[first - 1:first], float(run.fouled - first)
     plant = Process(_usual(), 0, x0, u0)
 
-    def other(one: Controller) -> Simulation:
+    def other(one: Controller) -> LoopRun:
         n_y = len(one.measured.names)
-        return simulate(
+        return run_loop(
             one, plant, [
                 at(0.0, Initialisation(u0)), at(fouled, on_plant(system=reactor(FOULING))),
                 *(at(sent, SetpointRequest(after_a_second(round(when * NANOSECONDS)),

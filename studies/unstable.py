@@ -20,9 +20,9 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.core.plots import table
 from koopman_ros.core.signals import Outputs
-from koopman_ros.evaluation import at, simulate
+from koopman_ros.evaluation import at, run_loop
+from koopman_ros.evaluation.loop import LoopRun
 from koopman_ros.evaluation.optimal_cost import cost_along, OptimalTrajectory, optimum, Task
-from koopman_ros.evaluation.simulate import Simulation
 from koopman_ros.execution import Backend, backend_of, Notify
 from koopman_ros.learning import compare, fit, IncrementalTraining, NeuralDrift, TrainingFailed
 from koopman_ros.learning.lift.multistart import Recipe
@@ -106,7 +106,7 @@ def controller(model: LiftedModel, laws: tuple[str, ...], limits: InputLimits = 
 
 
 def run(one: Controller, begin: float, end: float, samples: int, x0: Array | None = None,
-        **others: Any) -> Simulation:
+        **others: Any) -> LoopRun:
     """
     Run a controller on the true reactor, sampled each second, to a temperature.
 
@@ -115,7 +115,7 @@ def run(one: Controller, begin: float, end: float, samples: int, x0: Array | Non
     :param others: of the simulation.
     """
     rest, before = steady(begin)
-    return simulate(
+    return run_loop(
         one, Process(SYSTEM, 0, rest if x0 is None else x0, before),
         [at(0.0, Initialisation(before)), at(0.0, SetpointRequest(0, steady(end)[0][1:]))],
         period=PERIOD, duration=PERIOD * samples, **others)

@@ -83,6 +83,19 @@ def test_a_file_is_learned_tested_and_reported(day):
     assert '| test | level | best linear model |' in (folder / 'day.md').read_text()
 
 
+@pytest.mark.usefixtures('folder')
+def test_a_dead_time_and_a_characteristic_that_are_known_are_taken(day, capsys):
+    assert learned('--dead_time', f'pump={6 * PERIOD}', '--characteristic', 'pump=0:0,10:5',
+                   '--unmeasured_states', '0', '--model_output', 'known.safetensors',
+                   given=[str(day[0] / 'day.csv'), '--states', 'level', '--inputs', 'pump']) == 0
+    model = load('known.safetensors')
+    assert model.dead_time == [6 * PERIOD]
+    assert 'pump' in model.inputs.characteristics
+    printed = capsys.readouterr().out
+    assert f'no unmeasured state, dead time {6 * PERIOD:.4g} s of pump: accepted' in printed
+    assert "next: control by load('known.safetensors')" in printed
+
+
 def test_a_dead_time_is_found_and_belongs_to_the_model(day):
     folder, _ = day
     assert load(folder / 'day.safetensors').dead_time == pytest.approx([6 * PERIOD])
@@ -151,7 +164,11 @@ def test_a_present_model_names_the_signals_and_has_to_be_beaten(day, capsys):
 
 @pytest.mark.parametrize(('arguments', 'words'), [
     (['--states', 'height'], "no column 'height', it has 'time [s]'"),
-    (['--lag', 'heater'], '--lag heater must be inputs with a time constant'),
+    (['--lag', 'heater'], '--lag heater must be inputs with a time in s'),
+    (['--dead_time', 'pump=soon'], '--dead_time pump=soon must be inputs with a time in s'),
+    (['--dead_time', 'heater=5'], 'dead_time names heater'),
+    (['--characteristic', 'pump=0,1'], '--characteristic pump=0,1 must be inputs with points'),
+    (['--characteristic', 'heater=0:0,1:1'], 'characteristics name heater'),
     (['--lag', 'heater=5'], 'lag names heater'),
     (['--restarts', '0'], 'restarts = 0 must be in [1, 100]'),
     (['--unmeasured_states', '1', '--input_matrix_degree', '1'], 'input_matrix_degree is 1'),
@@ -184,7 +201,7 @@ def test_an_option_says_which_number_of_a_date_is_the_day(tmp_path, capsys, opti
 
 def test_the_module_is_the_program(tmp_path):
     found = subprocess.run(
-        [sys.executable, '-m', 'koopman_ros.learn', 'day.csv'], capture_output=True, text=True,
+        [sys.executable, '-m', 'koopman_ros', 'learn', 'day.csv'], capture_output=True, text=True,
         cwd=tmp_path, env={**os.environ, 'PYTHONPATH': str(Path(learn.__file__).parents[1])})
     assert found.returncode == 1
     assert found.stderr.startswith('learn: the signals are not known: give --states and --inputs')

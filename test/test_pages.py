@@ -431,7 +431,7 @@ def _check_command(command: list[str], folder: Path) -> None:
                 assert f"'{argument.partition(':=')[0]}'" in text, argument
         case ['ros2', 'run', 'plotjuggler', 'plotjuggler', '-l', path]:
             assert Path(path).is_file()
-        case ['python', '-m', 'koopman_ros.learn', *arguments] if arguments:
+        case ['python', '-m', 'koopman_ros', 'learn', *arguments] if arguments:
             learn_files.command_parser().parse_args(arguments)
         case ['python' | 'python3', '-m', module, *_]:
             assert find_spec(module), module

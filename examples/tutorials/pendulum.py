@@ -21,7 +21,7 @@ import numpy as np
 
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
 from koopman_ros.core.plots import draw_limits, DRAWN_RANGE, legend
-from koopman_ros.evaluation import at, evaluate_closed_loops, simulate
+from koopman_ros.evaluation import at, evaluate_closed_loops, run_loop
 from koopman_ros.learning import compare, IncrementalTraining, NeuralDrift
 from koopman_ros.plants import box_episodes, describe, plant_class, Process, RandomStepDesign
 
@@ -154,7 +154,7 @@ for contender in (found.contenders[0], found.chosen):
     controller = Controller(contender.model, Tuning.for_model(
         contender.model, state_weight=np.array([1.0 / 0.1 ** 2, 1.0]),
         input_weight=np.array([1.0 / 2.0 ** 2]), limits=limits, bumpless_transfer_time=30.0))
-    run = simulate(controller, start, [at(0.1, SetpointRequest(0, goal))], duration=2.0,
+    run = run_loop(controller, start, [at(0.1, SetpointRequest(0, goal))], duration=2.0,
                    period=0.02)
     runs[contender.name] = run
     held[contender.name] = run.reports[-1].target.input[0]

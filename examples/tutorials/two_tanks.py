@@ -23,7 +23,7 @@ import numpy as np
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.plots import draw_limits, DRAWN_RANGE, legend
-from koopman_ros.evaluation import at, simulate
+from koopman_ros.evaluation import at, run_loop
 from koopman_ros.learning import evaluate_model, learn_lift, Thresholds
 from koopman_ros.learning.identification import identify, WeakForm, WeakFormParameters
 from koopman_ros.model import load, save
@@ -173,7 +173,7 @@ tanks = Process(truth, 0, truth.nominal_state, truth.nominal_input)
 # %%
 asked = np.array([0.15, 0.08])
 try:
-    simulate(controller(0.1), tanks, [at(PERIOD, SetpointRequest(0, asked))], duration=PERIOD)
+    run_loop(controller(0.1), tanks, [at(PERIOD, SetpointRequest(0, asked))], duration=PERIOD)
 except ValueError as rejected:
     rejection = str(rejected)
     print(rejection)
@@ -196,7 +196,7 @@ def leak(loop):
 
 
 events = [at(20.0, SetpointRequest(0, GOAL)), at(LEAK_AT, leak)]
-runs = {name: simulate(controller(bandwidth), tanks, events, duration=400.0, period=PERIOD,
+runs = {name: run_loop(controller(bandwidth), tanks, events, duration=400.0, period=PERIOD,
                        noise=np.full(2, NOISE), seed=1)
         for name, bandwidth in (('without observer', 0.0), ('with observer', 0.1))}
 offsets = {}

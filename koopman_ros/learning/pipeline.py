@@ -40,8 +40,8 @@ from koopman_ros.learning.lift.training import TrainingFailed
 from koopman_ros.learning.model_selection import ClassComparison
 from koopman_ros.learning.pipeline_progress import JUDGED, OnProgress, PipelineProgress, WRITING
 from koopman_ros.learning.record import read_record, RecordSource, reduced, TrainingRecord
-from koopman_ros.learning.retrained import Retrained
 from koopman_ros.learning.task import resolve_signals, TrainingTask
+from koopman_ros.learning.training_result import TrainingResult
 from koopman_ros.model import LiftedModel, load, save
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT, SAME
 from koopman_ros.records import Record, RecordedInput, RecordedState
@@ -55,7 +55,7 @@ _LESS_FIT = 1.0
 
 
 def retrain(task: TrainingTask, on_progress: OnProgress | None = None, *,
-            record: Record | None = None, test: Record | None = None) -> Retrained:
+            record: Record | None = None, test: Record | None = None) -> TrainingResult:
     """
     Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
 
@@ -85,7 +85,7 @@ def retrain(task: TrainingTask, on_progress: OnProgress | None = None, *,
 
 
 def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
-             given: Record | None, test: Record | None) -> Retrained:
+             given: Record | None, test: Record | None) -> TrainingResult:
     progress, thresholds = PipelineProgress(on_progress), _checked(task)
     current, sibling = (load(path).joined if path else None
                         for path in (task.model, task.warm_start_model))
@@ -94,8 +94,9 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
             current.provenance.model_class or IDENTITY_LIFT))
     plant, states, inputs = resolve_signals(task, current)
     methods = methods_of(task.methods, task.method_parameters)
-    # a folder that cannot be written should fail now, not after the training
-    Path(task.output).parent.mkdir(parents=True, exist_ok=True)
+    if task.output:
+        # a folder that cannot be written should fail now, not after the training
+        Path(task.output).parent.mkdir(parents=True, exist_ok=True)
     units = [{one.name: one.unit for one in some} for some in (states, inputs)]
     test = None if test is None else test.of(*units)
     record = (_read(backend, task, states, inputs, current, progress) if given is None else
@@ -125,7 +126,7 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
                         nominal_state=box.states.center, nominal_input=box.inputs.center)
     elif found.hidden:
         plant = replace(current.plant, B=None, disturbance_names=plant.disturbance_names)
-    bare = Retrained(task, record.account, found, None, None, (), coverage(episodes, box),
+    bare = TrainingResult(task, record.account, found, None, None, (), coverage(episodes, box),
                      plant, current, reduction=record.reduction)
     learned, decision, reasons = _learn(bare, sibling, thresholds, progress, backend)
     if learned is None or decision is None:
@@ -148,12 +149,14 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     model = _with_provenance(learned.model, found, decision, min(bare.coverage.values()),
                              episodes, learned.chosen.name, runs['record']
                              ).with_disturbances(task.disturbances)
+    result = replace(bare, learned=learned.with_model(model), decision=decision,
+                     reasons=decision.reasons, free_runs=runs, compared_runs=others)
+    if not task.output:
+        return result
     path = _place(Path(task.output), decision.accepted)
     save(model, path)
-    return replace(bare, learned=learned.with_model(model), decision=decision,
-                   reasons=decision.reasons, model_file=str(path), free_runs=runs,
-                   compared_runs=others, alternative_files=_save_alternatives(
-                       Path(task.output), alternative_models(found, plant, dead_time)))
+    return replace(result, model_file=str(path), alternative_files=_save_alternatives(
+        Path(task.output), alternative_models(found, plant, dead_time)))
 
 
 def _save_alternatives(output: Path, models: Sequence[LiftedModel]) -> tuple[str, ...]:
@@ -220,12 +223,12 @@ def _checked(task: TrainingTask) -> Thresholds:
     if task.model_class not in (*CLASSES, BEST, SAME):
         raise ValueError(f'model_class = {task.model_class!r} must be one of '
                          f'{", ".join((*CLASSES, BEST, SAME))}')
-    if Path(task.output).suffix != '.safetensors':
+    if task.output and Path(task.output).suffix != '.safetensors':
         raise ValueError(f'output = {task.output!r} must end in .safetensors')
     return Thresholds(task.margin, task.condition)
 
 
-def _learn(bare: Retrained, sibling: LiftedModel | None, thresholds: Thresholds,
+def _learn(bare: TrainingResult, sibling: LiftedModel | None, thresholds: Thresholds,
            progress: PipelineProgress, backend: Backend
            ) -> tuple[ClassComparison | None, AcceptanceResult | None, tuple[str, ...]]:
     """Return the classes, the decision, and the reasons of a rejection; from a sibling first."""

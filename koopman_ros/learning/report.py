@@ -17,12 +17,12 @@ from koopman_ros.learning.downsampling import CELLS, visited_cells
 from koopman_ros.learning.identification import fitted_starts, Identified, longest_step, Segments
 from koopman_ros.learning.identification.drift import Rate
 from koopman_ros.learning.lift.metrics import lifted_rate
-from koopman_ros.learning.retrained import Retrained
+from koopman_ros.learning.training_result import TrainingResult
 from koopman_ros.model import Coordinates, RateBand
 from koopman_ros.model_classes import BEST
 
 
-def write_report(retrained: Retrained) -> list[Path]:
+def write_report(retrained: TrainingResult) -> list[Path]:
     """
     Write ``<output>.json``, ``.md`` and, with matplotlib, pictures; return the files.
 
@@ -44,7 +44,7 @@ def write_report(retrained: Retrained) -> list[Path]:
     return [*written, *(pictures.values() if drawn else [])]
 
 
-def reported(retrained: Retrained) -> tuple[dict[str, Any], tuple[str, ...]]:
+def reported(retrained: TrainingResult) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Write the report; return the summary, with a warning where that failed, and the files."""
     warnings = list(retrained.warnings)
     files: tuple[str, ...] = ()
@@ -56,7 +56,7 @@ def reported(retrained: Retrained) -> tuple[dict[str, Any], tuple[str, ...]]:
     return {**retrained.summary(), 'warnings': warnings}, files
 
 
-def _sections(retrained: Retrained) -> Iterator[str]:
+def _sections(retrained: TrainingResult) -> Iterator[str]:
     found, decision, learned = retrained.found, retrained.decision, retrained.learned
     states, inputs = found.drift.box.states, found.drift.box.inputs
     errors = tuple(f'error of {name} [{unit}]'
@@ -177,7 +177,7 @@ def _label(signals: Coordinates, k: int) -> str:
     return f'{signals.names[k].replace("_", " ")} [{unit_label(signals.units[k])}]'
 
 
-def _draw(path: Path, retrained: Retrained) -> bool:
+def _draw(path: Path, retrained: TrainingResult) -> bool:
     """Draw range of the data, learned model and predictions; False without matplotlib."""
     n_x = len(retrained.found.drift.box.states)
     try:
@@ -224,7 +224,7 @@ def _draw_coverage(axes: Any, found: Identified, i: int) -> None:
              title='measurements (visited cells in green)')
 
 
-def _lifts(retrained: Retrained) -> list[tuple[str, Rate, str]]:
+def _lifts(retrained: TrainingResult) -> list[tuple[str, Rate, str]]:
     """Return label, rate and colour of the current model and of the new one, where they are."""
     new = None if retrained.learned is None else retrained.learned.model
     seconds = SECONDS_PER_TIME_UNIT[retrained.plant.time_unit]
@@ -233,7 +233,7 @@ def _lifts(retrained: Retrained) -> list[tuple[str, Rate, str]]:
                                        ('new model', new, 'tab:green')) if model is not None]
 
 
-def _draw_drift(axes: Any, retrained: Retrained, i: int) -> None:
+def _draw_drift(axes: Any, retrained: TrainingResult, i: int) -> None:
     """Draw a state's rate over the state, the others and the inputs in the middle."""
     found = retrained.found
     box = found.drift.box
@@ -252,7 +252,7 @@ def _draw_drift(axes: Any, retrained: Retrained, i: int) -> None:
     axes.legend()
 
 
-def _draw_band(axes: Any, retrained: Retrained, band: RateBand, i: int) -> None:
+def _draw_band(axes: Any, retrained: TrainingResult, band: RateBand, i: int) -> None:
     """Draw a state's rate over the state where the data are, with its band and the data."""
     assert retrained.learned is not None
     states = retrained.learned.model.states
@@ -269,7 +269,7 @@ def _draw_band(axes: Any, retrained: Retrained, band: RateBand, i: int) -> None:
     axes.legend()
 
 
-def _draw_prediction(axes: Any, retrained: Retrained, i: int) -> None:
+def _draw_prediction(axes: Any, retrained: TrainingResult, i: int) -> None:
     found = retrained.found
     states = found.drift.box.states
     episode = found.held_out[0]

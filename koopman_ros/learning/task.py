@@ -29,7 +29,7 @@ class TrainingTask:
     """Input files, output file and settings of a retraining."""
 
     bags: tuple[str, ...]  #: files or folders
-    output: str  #: model file to write, ending in ``.safetensors``
+    output: str  #: model file to write, ending in ``.safetensors``; empty to write none
     model: str  #: file of the current model, empty to learn the first one
     states: tuple[RecordedState, ...]  #: those of the current model, in any order
     inputs: tuple[RecordedInput, ...]  #: likewise

@@ -51,11 +51,12 @@ def plant_class(name: str) -> Any:
     return load_plugin(name, 'plant', known)
 
 
-def build(plant: Any, values: Mapping[str, float], nominal_state: ArrayLike | None = None
-          ) -> ControlAffineSystem:
+def build(plant: Any, values: Mapping[str, float] | None = None,
+          nominal_state: ArrayLike | None = None) -> ControlAffineSystem:
     """
-    Build a plant of :func:`plant_class`.
+    Build a plant, e.g. ``build('two_tanks')``.
 
+    :param plant: its name, or its class, see :func:`plant_class`.
     :param values: constants in SI, by name, as :func:`constants_of` has them; the default of each
         that is missing.
     :param nominal_state: (n_x,) for a plant that raised EquilibriumError without, only then.
@@ -63,7 +64,8 @@ def build(plant: Any, values: Mapping[str, float], nominal_state: ArrayLike | No
         returns no ControlAffineSystem.
     :raises EquilibriumError: if the plant raises it.
     """
-    constants = in_plant_units(plant, values)
+    plant = plant_class(plant) if isinstance(plant, str) else plant
+    constants = in_plant_units(plant, values or {})
     # a callable need not have a name
     name = getattr(plant, '__name__', type(plant).__name__)
     try:

@@ -12,7 +12,7 @@ from koopman_ros.control import Controller, InputLimits, SetpointRequest, Tuning
 from koopman_ros.control import experiment as experiments
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.datasets import Episode
-from koopman_ros.evaluation import at, simulate
+from koopman_ros.evaluation import at, run_loop
 from koopman_ros.learning import (
     AcceptanceResult,
     evaluate_model,
@@ -181,7 +181,7 @@ def _controlled(system: ControlAffineSystem, model: LiftedModel, x0: Array, minu
         limits=InputLimits(np.array([278.15]), np.array([305.15]), np.ones(1)),
         bumpless_transfer_time=30.0))
     rng = np.random.default_rng([seed, 2])
-    run = simulate(
+    run = run_loop(
         controller, plants.Process(system, 0, np.asarray(x0), system.nominal_input),
         [at(0.0, SetpointRequest(0, np.array([SETPOINT])))], duration=60.0 * minutes - 1.0,
         sensor=lambda x, _: x + NOISE * rng.standard_normal(len(x)))

@@ -12,7 +12,7 @@ from koopman_ros.control import Controller, State
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.core.units import NANOSECONDS
-from koopman_ros.evaluation.simulate import after_a_second
+from koopman_ros.evaluation.loop import after_a_second
 from koopman_ros.model import LiftedModel
 from studies.partly_measured.cases import PartialCase
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.evaluation import at, perfect, ScheduledChange, Sensor, Simulation
+from koopman_ros.evaluation import at, LoopRun, perfect, ScheduledChange, Sensor
 from koopman_ros.plants import Actuator, ControlAffineSystem
 from studies.campaign import Metrics
 from studies.robustness import loop
@@ -49,7 +49,7 @@ class Disturbed:
     seconds: float = SECONDS  #: how long
     sensor: Sensor = perfect  #: of the temperature
 
-    def run(self, bandwidth: float = loop.BANDWIDTH) -> Simulation:
+    def run(self, bandwidth: float = loop.BANDWIDTH) -> LoopRun:
         """Simulate it with the default controller, from rest."""
         return loop.run_loop(
             loop.reactor_controller(bandwidth=bandwidth), self.system, self.seconds, self.changes,

@@ -15,7 +15,7 @@ from koopman_ros.control import Controller
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.units import SECONDS_PER_MINUTE
-from koopman_ros.evaluation import Simulation
+from koopman_ros.evaluation import LoopRun
 from koopman_ros.model import LiftedModel, load
 from koopman_ros.parameters.controller import built, table_of
 
@@ -84,12 +84,12 @@ def biased(bias: float, since: float = 0.0) -> evaluation.Sensor:
     return lambda y, seconds: y + (bias if seconds >= since else 0.0)
 
 
-def errors(run: Simulation, reference: float, since: float = 0.0) -> Array:
+def errors(run: LoopRun, reference: float, since: float = 0.0) -> Array:
     """Return the last state's distance from a reference from a time on."""
     return np.asarray(run.states[run.times >= since, -1] - reference)
 
 
-def settling(run: Simulation, reference: float, tolerance: float, since: float = 0.0
+def settling(run: LoopRun, reference: float, tolerance: float, since: float = 0.0
              ) -> float | None:
     """Return the seconds from `since` until it stays that close; None for never."""
     outside = np.flatnonzero(np.abs(errors(run, reference, since)) > tolerance)
@@ -101,12 +101,12 @@ def settling(run: Simulation, reference: float, tolerance: float, since: float =
     return float(start[outside[-1] + 1] - since)
 
 
-def worst(run: Simulation) -> str:
+def worst(run: LoopRun) -> str:
     """Return the last of the levels that acted."""
     return max(run.levels, key=run.loop.controller.order.levels.index)
 
 
-def overshoot(run: Simulation, reference: float, since: float) -> float:
+def overshoot(run: LoopRun, reference: float, since: float) -> float:
     """Return how far the last state falls below a reference from a time on; 0 for not."""
     return max(0.0, float(np.max(-errors(run, reference, since))))
 
@@ -114,7 +114,7 @@ def overshoot(run: Simulation, reference: float, since: float) -> float:
 def run_loop(controller: Controller, system: plants.ControlAffineSystem, seconds: float,
              events: Iterable[evaluation.ScheduledChange] = (), *, x0: Iterable[float] = (START,),
              coolant: float | None = None, actuator: plants.Actuator | None = None,
-             tells: bool = False, noise: float = 0.0, **others: Any) -> Simulation:
+             tells: bool = False, noise: float = 0.0, **others: Any) -> LoopRun:
     """
     Simulate a loop whose controller takes over from an applied input at the state x0 (n,).
 
@@ -128,7 +128,7 @@ def run_loop(controller: Controller, system: plants.ControlAffineSystem, seconds
     held = plants.equilibrium_input(system, x) if coolant is None else np.array([coolant])
     plant = plants.Process(system, 0, x, held, actuator or plants.Actuator(), held)
     n_x = controller.model.n_x
-    return evaluation.simulate(
+    return evaluation.run_loop(
         controller, plant, [evaluation.at(0.0, control.Initialisation(held)), *events],
         duration=seconds, C=np.eye(system.n_x)[-n_x:],
         noise=np.full(n_x, noise) if noise else None,
@@ -136,7 +136,7 @@ def run_loop(controller: Controller, system: plants.ControlAffineSystem, seconds
 
 
 def run_late(model: LiftedModel, dead_time: float, system: plants.ControlAffineSystem,
-             seconds: float, *events: evaluation.ScheduledChange, **others: Any) -> Simulation:
+             seconds: float, *events: evaluation.ScheduledChange, **others: Any) -> LoopRun:
     """Run the loop by the default parameters from rest, behind a dead time in s."""
     return run_loop(reactor_controller(model=model, bandwidth=None), system, seconds, events,
                     actuator=plants.Actuator(dead_time=dead_time), **others)

@@ -10,7 +10,7 @@ import numpy as np
 
 from koopman_ros import control, evaluation
 from koopman_ros.control import Controller
-from koopman_ros.evaluation import at, Simulation
+from koopman_ros.evaluation import at, LoopRun
 from koopman_ros.learning import IncrementalTraining, train
 from koopman_ros.plants import box_episodes, describe, RandomStepDesign
 from studies.campaign import Metrics
@@ -36,7 +36,7 @@ class Trial:
     bandwidth: float = loop.BANDWIDTH  #: of the observer, in 1/min
     changes: Sequence[evaluation.ScheduledChange] = ()  #: events with their times, in s
 
-    def run(self, controller: Controller) -> Simulation:
+    def run(self, controller: Controller) -> LoopRun:
         """Drive the true reactor to its steady state."""
         return loop.run_loop(
             controller, REACTOR, SECONDS, [at(0.0, loop.at_setpoint(START)), *self.changes],
@@ -50,7 +50,7 @@ TRIALS = (
     Trial('start at 300 K', 300.0))
 
 
-def reactor_courses() -> dict[tuple[str, str], Simulation]:
+def reactor_courses() -> dict[tuple[str, str], LoopRun]:
     """Run all trials: by their name and ``narrow``, ``guarded`` (with fallback) or ``wide``."""
     # an hour of steps within 1.5 K of the steady state
     samples = box_episodes(REACTOR, DESIGN, 60, 1.0, 0)
@@ -62,7 +62,7 @@ def reactor_courses() -> dict[tuple[str, str], Simulation]:
                                       ('wide', None, True))}
 
 
-def judge_reactor(course: Simulation, since: float = 0.0) -> Metrics:
+def judge_reactor(course: LoopRun, since: float = 0.0) -> Metrics:
     """Return the result of a trial; it ran away above 350 K, and time counts from `since` s on."""
     hottest = float(np.max(course.states))
     return {'hottest_kelvin': hottest, 'final_kelvin': float(course.states[-1, 0]),

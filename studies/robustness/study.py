@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from koopman_ros.evaluation import Simulation
+from koopman_ros.evaluation import LoopRun
 from koopman_ros.execution import Backend
 from studies.campaign import over
 from studies.robustness import disturbances, narrow, stability
@@ -19,7 +19,7 @@ from studies.robustness.stability import margins_at
 
 BANDWIDTHS = (0.0, 2.0, 4.0, 6.0, 10.0)  # 1/min
 COOLANT_WEIGHTS = (1.0, 0.1)  # 1/K^2
-Courses: TypeAlias = dict[tuple[str, str], Simulation]  # by trial and kind of lift
+Courses: TypeAlias = dict[tuple[str, str], LoopRun]  # by trial and kind of lift
 TEMPERATURES = tuple(map(float, np.linspace(305.5, 326.5, 8)))  # K
 
 

@@ -17,7 +17,7 @@ from koopman_ros.control.laws import StateDependentRiccati
 from koopman_ros.core.status import StatusCode
 from koopman_ros.estimation import AppliedInputs, Estimate, PendingInputs
 from koopman_ros.estimation.kalman_filters import uncertainty
-from koopman_ros.evaluation import at, exchange, perfect, simulate
+from koopman_ros.evaluation import at, exchange, perfect, run_loop
 from koopman_ros.evaluation.optimal_cost import cost_along, Task
 from koopman_ros.event_log.records import decoded, encoded
 from koopman_ros.model import Coordinates, linearised_model, Provenance
@@ -53,7 +53,7 @@ def late_reactor(seconds, known=None, plant=REACTOR, **given):
 
 
 def step(loop, plant, state, duration, *events):
-    run = simulate(loop, plant, [at(5.0, SetpointRequest(0, np.array([SETPOINT]))), *events],
+    run = run_loop(loop, plant, [at(5.0, SetpointRequest(0, np.array([SETPOINT]))), *events],
                    duration=duration, state=state, input_sensor=perfect)
     assert not run.failure
     assert set(run.levels) == {'sdre'}
@@ -181,7 +181,7 @@ def test_no_sensor_is_called_stuck_before_an_effect_can_be_seen(share, plant, st
     loop, process, state = late_reactor(60.0 * share, 60.0, plant)
     loop = replace(loop, tuning=replace(loop.tuning, sensor=replace(
         loop.tuning.sensor, jump=np.array([0.5]), stuck_sensor_timeout=20.0)))
-    run = simulate(loop, process, [at(start, SetpointRequest(0, np.array([SETPOINT])))],
+    run = run_loop(loop, process, [at(start, SetpointRequest(0, np.array([SETPOINT])))],
                    duration=start + 400.0, period=2.0, state=state, sensor=quantised(0.5))
     assert {report.level for report in run.reports} == {'sdre'}
 
@@ -190,7 +190,7 @@ def test_a_stuck_sensor_behind_a_dead_time_is_found():
     loop, process, state = late_reactor(60.0, stuck_sensor_timeout=20.0)
     loop = replace(loop, tuning=replace(loop.tuning, sensor=replace(
         loop.tuning.sensor, stuck_sensor_timeout=20.0)))
-    run = simulate(loop, process, [at(10.0, SetpointRequest(0, np.array([SETPOINT])))],
+    run = run_loop(loop, process, [at(10.0, SetpointRequest(0, np.array([SETPOINT])))],
                    duration=260.0, period=2.0, state=state, sensor=quantised(0.1, 40.0))
     held = [2.0 * k for k, report in enumerate(run.reports) if report.level == 'hold']
     # the coolant acts from 70 s on, and two dead times more are waited for
@@ -270,7 +270,7 @@ def test_the_covariance_is_predicted_over_a_dead_time_for_a_law_that_reads_it(ki
         loop, plant, state = late_reactor(
             30.0, estimator=f'{kind}_kalman_filter',
             fallback_order=(f'{__name__}:{law.__name__}',))
-        now = simulate(loop, plant, [at(5.0, SetpointRequest(0, np.array([SETPOINT])))],
+        now = run_loop(loop, plant, [at(5.0, SetpointRequest(0, np.array([SETPOINT])))],
                        duration=20.0, period=2.0, state=state).loop.state
         found[law] = now.law_memory
         measured = now.estimate.covariance[0, 0]
@@ -287,7 +287,7 @@ def test_every_law_and_filter_acts_on_the_prediction(levels, estimator):
     gains = {'pi.temperature.gain': 1.0, 'pi.temperature.integral_time': 60.0}
     loop, plant, state = late_reactor(
         30.0, 27.0, estimator=estimator, fallback_order=levels, **gains)
-    run = simulate(loop, plant, [at(5.0, SetpointRequest(0, np.array([SETPOINT])))],
+    run = run_loop(loop, plant, [at(5.0, SetpointRequest(0, np.array([SETPOINT])))],
                    duration=440.0, period=2.0, state=state)
     assert set(run.levels) == {levels[0]}
     # a PI law has its own overshoot, and without prediction it would swing
@@ -350,7 +350,7 @@ def test_each_input_is_computed_for_the_state_at_which_it_acts(dead_time):
     """Where the model is right, as if there were no dead time."""
     loop = two_inputs(dead_time)
     goal = np.array([2.0, -1.0])
-    run = simulate(loop, Linear(dead_time, np.zeros(2)), [at(2.0, SetpointRequest(0, goal))],
+    run = run_loop(loop, Linear(dead_time, np.zeros(2)), [at(2.0, SetpointRequest(0, goal))],
                    duration=30.0, period=PERIOD)
     gain, target = loop.best.law, loop.best.target(goal, np.zeros(2), None)
     plant = Linear(dead_time, np.zeros(2), commands=run.loop.plant.commands)
@@ -369,7 +369,7 @@ def test_a_plan_uses_the_inputs_under_way():
     for law in ('sdre', 'mpc'):
         loop = two_inputs(dead_time, fallback_order=(law,), limits=InputLimits(
             np.full(2, -4.0), np.full(2, 4.0), np.array([2.0, 0.8])))
-        run = simulate(loop, Linear(dead_time, np.zeros(2)), [at(2.0, SetpointRequest(0, goal))],
+        run = run_loop(loop, Linear(dead_time, np.zeros(2)), [at(2.0, SetpointRequest(0, goal))],
                        duration=30.0, period=PERIOD)
         assert set(run.levels) == {law}
         target, e = loop.best.target(goal, np.zeros(2), None), run.states[4:] - goal

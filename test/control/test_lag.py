@@ -11,7 +11,7 @@ import pytest
 from koopman_ros.control import Controller, InputLimits, SetpointRequest, State
 from koopman_ros.core.datasets import DriftSamples, PlantDescription
 from koopman_ros.estimation import DisturbanceObserver, Estimate
-from koopman_ros.evaluation import at, exchange, perfect, simulate
+from koopman_ros.evaluation import at, exchange, perfect, run_loop
 from koopman_ros.evaluation.optimal_cost import cost_along, optimum, Task
 from koopman_ros.event_log.records import decoded, encoded
 from koopman_ros.learning.lift.edmd import Edmd
@@ -39,7 +39,7 @@ def controller_of(model, **given):
 def step(loop, lag, duration, *events, plant=REACTOR, period=1.0):
     x = np.array([START])
     u = equilibrium_input(plant, x)
-    run = simulate(loop, Process(plant, 0, x, u, Actuator(lag=lag), u), [
+    run = run_loop(loop, Process(plant, 0, x, u, Actuator(lag=lag), u), [
         at(BEGIN, SetpointRequest(0, np.array([SETPOINT]))), *events], duration=duration,
         period=period, state=loop.initialise(State(), u), input_sensor=perfect, C=np.eye(1))
     assert not run.failure
@@ -155,7 +155,7 @@ def test_behind_a_lag_and_a_valve_steps_of_any_size_are_nearly_optimal(start, st
                 np.diag(weights.Q) / model.states.scale ** 2,
                 np.diag(weights.R) / model.inputs.scale ** 2, 1.0, 200)
     assert task.Q[1] == 0.0
-    run = simulate(loop, Process(TANK, 0, np.array([start]), u0, VALVE, u0), [
+    run = run_loop(loop, Process(TANK, 0, np.array([start]), u0, VALVE, u0), [
         at(0.0, SetpointRequest(0, np.array([start]))),
         at(BEGIN, SetpointRequest(0, np.array([start + step])))], duration=BEGIN + 199.0,
         C=np.eye(1), state=loop.initialise(State(), u0))

@@ -12,7 +12,7 @@ import pytest
 from koopman_ros.control import Controller, events, State
 from koopman_ros.core.status import StatusCode
 from koopman_ros.estimation import check_disturbances, MeasuredDisturbances
-from koopman_ros.evaluation import at, exchange, simulate
+from koopman_ros.evaluation import at, exchange, run_loop
 from koopman_ros.event_log.records import decoded, encoded
 from koopman_ros.model import Coordinates
 from koopman_ros.plants import equilibrium_input, one_state_reactor, Process, ReactorParameters
@@ -50,7 +50,7 @@ def run(loop, measure=lambda kelvin, seconds: kelvin, *more, before=NOMINAL, dur
 
     x = np.array([START])
     u = equilibrium_input(reactor(before), x)
-    found = simulate(loop, Process(reactor(before), 0, x, u), [at(BEGIN, changed), *more],
+    found = run_loop(loop, Process(reactor(before), 0, x, u), [at(BEGIN, changed), *more],
                      duration=duration, state=loop.initialise(State(), u),
                      disturbances=lambda seconds: np.array([measure(feed(seconds), seconds)]))
     assert not found.failure

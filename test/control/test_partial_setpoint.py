@@ -17,7 +17,7 @@ from koopman_ros.core.status import StatusCode
 from koopman_ros.core.steady_state import Goal
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.estimation import Estimate
-from koopman_ros.evaluation import at, run_closed_loop, simulate
+from koopman_ros.evaluation import at, run_closed_loop, run_loop
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.model.observables import PolynomialObservables
 from koopman_ros.model.steady_state import model_steady_state
@@ -409,7 +409,7 @@ class Tanks:
 
 def test_the_controlled_levels_arrive_and_the_others_where_they_are_needed():
     controller, load = loop(THREE, 'h2', 'h3'), np.array([0.01, -0.02, 0.015])
-    run = simulate(controller, Tanks(THREE, load, np.ones(3), np.full(2, 3.0)), [
+    run = run_loop(controller, Tanks(THREE, load, np.ones(3), np.full(2, 3.0)), [
         at(5.0, SetpointRequest(0, np.array([1.3]), ('h2',))),
         at(5.0, SetpointRequest(0, np.array([0.8]), ('h3',)))], duration=400.0)
     assert run.setpoints.shape == (401, 2)
@@ -433,7 +433,7 @@ def test_the_lower_two_of_four_tanks_under_a_model_that_is_not_the_plant():
                              Provenance('four tanks'))
     controller = loop(model, 'level_1', 'level_2', upper=6.0)
     wanted = x[:2] * [1.2, 0.85]
-    run = simulate(controller, Process(plant, 0, x, u, Actuator(), u), [
+    run = run_loop(controller, Process(plant, 0, x, u, Actuator(), u), [
         at(10.0, SetpointRequest(0, wanted[:1], ('level_1',))),
         at(300.0, SetpointRequest(0, wanted[1:], ('level_2',)))], duration=2500.0, period=5.0)
     # what leaves a tank, a sqrt(2 g h), fills the one below, beside what the pumps give

@@ -19,7 +19,7 @@ from koopman_ros.control import (
 from koopman_ros.control.laws.pi import PIParameters
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS as SECOND
-from koopman_ros.evaluation import at, simulate
+from koopman_ros.evaluation import at, run_loop
 from koopman_ros.model import Coordinates, linearised_model, load, Provenance, save
 from koopman_ros.plants import ControlAffineSystem, Process, steady_state, two_state_reactor
 from studies.general.systems import SADDLE
@@ -52,7 +52,7 @@ def controller(model=None, *, lower=-1e3, upper=1e3, rate=np.inf, laws=('pi',), 
 
 
 def run(one, setpoint=10.0, seconds=200.0, u=0.0, events=()):
-    return simulate(one, Process(PLANT, 0, np.zeros(1), np.full(1, u)), [
+    return run_loop(one, Process(PLANT, 0, np.zeros(1), np.full(1, u)), [
         at(0.0, Initialisation(np.full(1, u))), at(0.0, SetpointRequest(0, np.array([setpoint]))),
         *events], duration=seconds)
 
@@ -144,7 +144,7 @@ def test_the_reactor_is_held_at_its_saddle_at_several_setpoints():
                      setpoint_ramp=np.array([0.05]))
     x0, u0 = steady_state(system, {'temperature': 350.0})
     rng = np.random.default_rng(0)
-    loop = simulate(one, Process(system, 0, x0, u0), [
+    loop = run_loop(one, Process(system, 0, x0, u0), [
         at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([350.0]))),
         *(at(300.0 * k, SetpointRequest(0, np.array([rng.uniform(340.0, 360.0)])))
           for k in range(1, 5))], duration=1500.0, C=np.array([[0.0, 1.0]]), noise=np.array([0.1]))

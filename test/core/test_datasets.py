@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.core.datasets import cut, DriftSamples, Episode, split_by_episode, within
-from koopman_ros.evaluation import Simulation
+from koopman_ros.evaluation import LoopRun
 from support.small_plants import BENT, bent_samples, TWO_STATE
 
 
@@ -237,7 +237,7 @@ def test_lists_are_taken_for_arrays():
 
 
 @pytest.mark.parametrize('described', [
-    bent_samples(), BENT, irregular(), Simulation(
+    bent_samples(), BENT, irregular(), LoopRun(
         *(np.zeros((400, n)) for n in (1, 2, 2, 1, 1, 2)), (None,) * 400, '', None)],
     ids=lambda value: type(value).__name__)
 def test_the_repr_of_large_objects_is_one_line(described):

@@ -35,8 +35,8 @@ from koopman_ros.estimation import (
     UnscentedKalmanFilter,
 )
 from koopman_ros.estimation.kalman_filters import uncertainty
-from koopman_ros.evaluation import at, exchange, Loop, simulate
-from koopman_ros.evaluation.simulate import Simulation
+from koopman_ros.evaluation import at, exchange, Loop, run_loop
+from koopman_ros.evaluation.loop import LoopRun
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import Process, steady_state, two_state_reactor
 from koopman_ros.plants.library.reactor import ReactorParameters
@@ -180,10 +180,10 @@ def saddle(model: LiftedModel = TRUTH, **changes: object) -> Controller:
 
 
 def run(one: Controller, *events: object, goal: float = 350.0, wrong: float = 0.0,
-        **options: object) -> Simulation:
+        **options: object) -> LoopRun:
     """Lead the reactor from rest at 350 K, with a wrong initial concentration."""
     x0, u0 = steady_state(SYSTEM, {'temperature': 350.0})
-    return simulate(one, Process(SYSTEM, 0, x0 + np.array([wrong, 0.0]), u0), [
+    return run_loop(one, Process(SYSTEM, 0, x0 + np.array([wrong, 0.0]), u0), [
         at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([goal]))), *events],
         noise=np.array([NOISE]), **options)
 
@@ -276,7 +276,7 @@ def test_a_start_up_from_far_outside_the_data_arrives():
     one = saddle(limits=limits, setpoint_ramp=np.array([0.1]), fallback_order=('sdre', 'pi'),
                  linear_model_margin=3.0, plugins={'pi': PIParameters([0.0, 8.0], [1.0, 120.0])})
     u0 = np.array([300.0])
-    loop = simulate(one, Process(SYSTEM, 0, np.array([0.95, 300.0]), u0), [
+    loop = run_loop(one, Process(SYSTEM, 0, np.array([0.95, 300.0]), u0), [
         at(0.0, Initialisation(u0)), at(5.0, SetpointRequest(0, np.array([350.0])))],
         duration=800.0, noise=np.array([NOISE]), seed=7)
     levels = loop.levels
@@ -425,7 +425,7 @@ def test_another_fallback_order_keeps_the_estimated_rate():
             measurement_noise=np.array([0.02]), disturbance_noise=np.array([0.1])), TEMPERATURE)
 
     x0, u0 = steady_state(plant, {'temperature': 312.15})
-    loop = simulate(
+    loop = run_loop(
         with_levels('pi', pi=PIParameters([0.0, 3.0], [1.0, 60.0])), Process(plant, 0, x0, u0), [
             at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([312.15]))),
             at(20.0, exchange(with_levels('sdre', 'linear')))],

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.control import Controller, State
-from koopman_ros.evaluation import at, simulate
+from koopman_ros.evaluation import at, run_loop
 from koopman_ros.learning import retrain
 from koopman_ros.model import load
 from koopman_ros.plants import equilibrium_input, one_state_reactor, Process, ReactorParameters
@@ -45,7 +45,7 @@ def test_a_measured_step_of_the_feed_peaks_at_a_third_of_an_unmeasured_one(model
     loop = Controller(prompt, Tuning.for_model(prompt, observer_bandwidth=0.1))
     peaks = {}
     for feed in (355.0, 350.0):
-        run = simulate(
+        run = run_loop(
             loop, Process(replace(system, nominal_state=x, nominal_input=u), 0, x, u),
             [at(20.0, lambda now: replace(now, plant=replace(now.plant, system=warm)))],
             duration=200.0, state=loop.initialise(State(), u),

@@ -11,7 +11,7 @@ import pytest
 
 from koopman_ros.control import Controller, Initialisation, InputLimits, SetpointRequest, Tuning
 from koopman_ros.core.paths import model_path
-from koopman_ros.evaluation import at, simulate
+from koopman_ros.evaluation import at, run_loop
 from koopman_ros.evaluation.optimal_cost import cost_along, linear_law, optimum, Task
 from koopman_ros.learning import fit
 from koopman_ros.model import load
@@ -242,7 +242,7 @@ def keeps(name, model):
         model, state_weight=task.Q, input_weight=task.R,
         limits=InputLimits(lower, upper, np.full(system.n_u, np.inf)),
         fallback_order=('sdre',), bumpless_transfer_time=30.0)
-    loop = simulate(
+    loop = run_loop(
         Controller(model, settings), Process(system, 0, task.x0, system.nominal_input),
         [at(0.0, SetpointRequest(0, x_ref))], period=promise.period,
         duration=promise.period * promise.samples)
@@ -280,7 +280,7 @@ def test_the_lift_at_the_saddle_holds_it_from_the_temperature_alone():
     assert (model.n_z, model.provenance.seed) == (2, 0)
     assert max(model.provenance.metrics[figure] for figure in ('rw', 'rx')) < 1e-6
     wanted, (x0, u0) = SADDLE_TEMPERATURE, steady(SADDLE_TEMPERATURE)
-    loop = simulate(
+    loop = run_loop(
         saddle.controller(model, ('sdre',), saddle.WIDE), Process(saddle.SYSTEM, 0, x0, u0), [
             at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([wanted]))),
             at(60.0, on_plant(system=saddle.reactor(saddle.FOULING)))],

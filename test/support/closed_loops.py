@@ -156,7 +156,7 @@ class Reactor:
             found = sensor(float(y[0])) if sensor else self.sensor(y, second)
             return None if found is None else np.reshape(found, 1)
 
-        run = evaluation.simulate(
+        run = evaluation.run_loop(
             self.loop.controller, self.loop.plant.until(first * SECOND),
             [evaluation.at(0.0, what) for what in self.waiting], duration=seconds - 1.0,
             C=np.eye(len(self.loop.plant.x))[-1:], seed=first, sensor=measure,

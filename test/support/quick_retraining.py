@@ -43,7 +43,7 @@ def quick_retraining(loops: int, degrees: tuple[int, ...] = (1, 3),
         yield
 
 
-def page_of(retrained: pipeline.Retrained) -> str:
+def page_of(retrained: pipeline.TrainingResult) -> str:
     """Return what the page of a retraining says; its picture takes half a second to draw."""
     return '\n\n'.join(map(str, _sections(retrained)))
 

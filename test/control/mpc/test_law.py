@@ -25,8 +25,8 @@ from koopman_ros.core.paths import model_path
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.units import NANOSECONDS
 from koopman_ros.estimation import Estimate
+from koopman_ros.evaluation.loop import at, LoopRun, run_loop
 from koopman_ros.evaluation.optimal_cost import cost_along, optimum, Task
-from koopman_ros.evaluation.simulate import at, simulate, Simulation
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, load, Provenance
 from koopman_ros.plants import Actuator, ControlAffineSystem, plant_class, Process, steady_state
 from support.random_lifts import random_lift
@@ -86,10 +86,10 @@ def compute(one: RecedingHorizon, x: list[float], goal: tuple[float, ...] = (0.0
 
 
 def run(pair: tuple[ControlAffineSystem, LiftedModel], x0: list[float], goal: list[float],
-        samples: int = 100, own: MPCParameters | None = None, **given: object) -> Simulation:
+        samples: int = 100, own: MPCParameters | None = None, **given: object) -> LoopRun:
     system, model = pair
     plugins = {} if own is None else {'mpc': own}
-    return simulate(
+    return run_loop(
         Controller(model, tuning(model, plugins=plugins, **given)),
         Process(system, 0, np.array(x0), np.zeros(system.n_u)),
         [at(0.0, SetpointRequest(0, np.array(goal)))], period=PERIOD, duration=PERIOD * samples)
@@ -252,7 +252,7 @@ def test_a_scheduled_setpoint_is_prepared_for(monkeypatch, dead_time):
 
     def tracked() -> tuple[float, np.ndarray]:
         """Return the integral of the squared error, and the commands before the set-point."""
-        loop = simulate(
+        loop = run_loop(
             Controller(model, tuning(model)),
             Process(system, 0, np.zeros(2), np.zeros(1), Actuator(dead_time=dead_time)),
             [at(0.0, SetpointRequest(4 * NANOSECONDS, np.array([1.0, 0.0])))],
@@ -282,7 +282,7 @@ def test_on_a_learned_lift_it_costs_next_to_the_optimum_of_the_plant(name, perio
     x_ref, u_ref = steady_state(system, goal)
     task = Task(system, x0, x_ref, u_ref, weights, scale, period / system.seconds_per_time_unit,
                 samples)
-    loop = simulate(
+    loop = run_loop(
         Controller(model, tuning(model, state_weight=weights, input_weight=scale,
                                  limits=limits(1e6))),
         Process(system, 0, x0, system.nominal_input), [at(0.0, SetpointRequest(0, x_ref))],

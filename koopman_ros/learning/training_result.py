@@ -1,16 +1,17 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Result of a retraining, and its figures."""
+"""Result of a training, and its figures."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+import os
 
 import numpy as np
 
-from koopman_ros.core.arrays import Array, short_repr
+from koopman_ros.core.arrays import Array, short_repr, show_printed
 from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.plots import finite
 from koopman_ros.core.units import SECONDS_PER_TIME_UNIT
@@ -20,7 +21,7 @@ from koopman_ros.learning.identification import DriftModel, Identified, LaggedDr
 from koopman_ros.learning.model_selection import ClassComparison, ModelCandidate
 from koopman_ros.learning.record import Reduction
 from koopman_ros.learning.task import TrainingTask
-from koopman_ros.model import COMMANDED, LiftedModel
+from koopman_ros.model import COMMANDED, LiftedModel, save
 from koopman_ros.records import ImportReport
 
 
@@ -37,8 +38,8 @@ def _of_plant(about: PlantAcceptance) -> dict[str, object]:
 
 
 @dataclass(frozen=True)
-class Retrained:
-    """Result of a retraining."""
+class TrainingResult:
+    """Result of a training."""
 
     task: TrainingTask  #: the task
     account: ImportReport  #: counts of used and dropped measurements
@@ -61,6 +62,47 @@ class Retrained:
     compared_runs: Mapping[str, Mapping[str, FreeRun]] = field(default_factory=dict)
 
     __repr__ = short_repr
+    _repr_pretty_ = show_printed
+
+    def __str__(self) -> str:
+        """Show what was found, the verdict, the free runs and the warnings."""
+        return '\n'.join([
+            f'{self.task.plant}: {self.found_text}: '
+            + ('accepted' if self.accepted else 'rejected'),
+            *(f'reason: {one}' for one in self.reasons),
+            *(f'{name}: {run}' for name, run in self.free_runs.items()),
+            *filter(None, [self.decision.statement if self.decision else '']),
+            *(f'warning: {one}' for one in self.warnings)])
+
+    @property
+    def model(self) -> LiftedModel:
+        """
+        The model, accepted or not.
+
+        :raises ValueError: where none was learned, with the reasons.
+        """
+        if self.learned is None:
+            raise ValueError('no model was learned: ' + '; '.join(self.reasons))
+        return self.learned.model
+
+    @property
+    def found_text(self) -> str:
+        """What was found in the record, in a line."""
+        hidden, names = self.found.hidden, self.found.drift.box.inputs.names
+        late = [f'{what} {seconds:.4g} s of {name}' for what, values in (
+            ('dead time', self.dead_time), ('lag', self.lag))
+            for name, seconds in zip(names, values.tolist(), strict=True) if seconds > 0.0]
+        return ', '.join([
+            self.found.drift.form, f'{hidden or "no"} unmeasured state{"s" * (hidden > 1)}',
+            *(late or ['no dead time'])])
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """
+        Write the model file, with the verdict in it.
+
+        :param path: ending in ``.safetensors``.
+        """
+        save(self.model, path)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -113,6 +155,7 @@ class Retrained:
 
         figures: dict[str, object] = {
             'accepted': self.accepted,
+            'found': self.found_text,
             'model_class': 'none learned' if self.learned is None else self.learned.chosen.name,
             'reasons': list(self.reasons),
             'warnings': list(self.warnings),

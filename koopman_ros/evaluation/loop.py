@@ -6,6 +6,8 @@
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 import math
+import os
+from pathlib import Path
 from typing import Protocol, Self, TypeAlias
 
 import numpy as np
@@ -18,9 +20,10 @@ from koopman_ros.control.laws.base import Target
 from koopman_ros.control.state import State, StepReport
 from koopman_ros.control.steady_state import steady_state_target
 from koopman_ros.core.arrays import Array, frozen, short_repr
+from koopman_ros.core.plots import draw_limits, drawing
 from koopman_ros.core.signals import per_signal
 from koopman_ros.core.status import reason, StatusFormatter
-from koopman_ros.core.units import Displays, NANOSECONDS
+from koopman_ros.core.units import Displays, NANOSECONDS, shown, unit_label
 from koopman_ros.model import LiftedModel
 
 # what is measured (n,) of a value (n,) at a time in s; NaN for what is not, None for no message
@@ -102,7 +105,7 @@ def after_a_second(time_ns: int) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class Simulation:
+class LoopRun:
     """The trajectories of a loop, one row per sample."""
 
     times: Array  #: (N,) in s from the start
@@ -122,19 +125,54 @@ class Simulation:
         """The control levels that acted."""
         return tuple(report.level for report in self.reports)
 
+    def draw(self, path: str | os.PathLike[str]) -> None:
+        """
+        Draw measurements with set-points, and commands with their limits, as PNG.
 
-def simulate(controller: Controller, plant: Plant, events: Iterable[ScheduledChange] = (), *,
+        :raises ImportError: without matplotlib.
+        """
+        controller = self.loop.controller
+        outputs, inputs, limits = (controller.measured, controller.model.inputs,
+                                   controller.tuning.limits)
+        controlled, n_y = list(controller.controlled.names), len(outputs.names)
+        signals = [*zip(outputs.names, outputs.units, strict=True),
+                   *zip(inputs.names, inputs.units, strict=True)]
+        with drawing(Path(path), len(signals), size=(8.0, 1.9 * len(signals) + 0.6), sharex=True
+                     ) as (_, panels):
+            for i, (axes, (name, unit)) in enumerate(zip(panels, signals, strict=True)):
+                if i < n_y:
+                    axes.plot(self.times, shown(self.measured[:, i], unit), label='measured')
+                    if name in controlled:
+                        axes.step(self.times, shown(
+                            self.setpoints[:, controlled.index(name)], unit), where='post',
+                            color='k', linestyle='--', linewidth=1.0, label='set-point')
+                else:
+                    axes.step(self.times, shown(self.commands[:, i - n_y], unit), where='post',
+                              color='tab:green', label='command')
+                    draw_limits(axes, (shown(end[i - n_y], unit) for end in (
+                        limits.lower, limits.upper)), 'limits')
+                axes.set_ylabel(f'{name.replace("_", " ")} [{unit_label(unit)}]')
+                axes.legend(fontsize=8, loc='lower right', bbox_to_anchor=(1.0, 1.0), ncols=2,
+                            frameon=False)
+            panels[-1].set_xlabel('time [s]')
+
+
+def run_loop(controller: Controller, plant: Plant, events: Iterable[ScheduledChange] = (), *,
              duration: float, period: float = 1.0, C: Array | None = None,
              noise: Array | None = None, seed: int = 0, sensor: Sensor = perfect,
              input_sensor: Sensor | None = None, state: State | None = None,
              stamp: Callable[[int], int] = after_a_second,
              stop: Callable[[Array, Array, StepReport], bool] | None = None,
-             disturbances: Callable[[float], Array | None] = lambda _: None) -> Simulation:
+             disturbances: Callable[[float], Array | None] = lambda _: None) -> LoopRun:
     """
     Run a controller and a plant, sampled at 0, period, 2 period, ... up to the duration.
 
     A sample measures, lets the controller answer and gives its command to the plant. The same
-    arguments give the same numbers.
+    arguments give the same numbers. Example::
+
+        run = run_loop(controller, plant, [at(20.0, SetpointRequest(0, [0.1, 0.15]))],
+                       duration=400.0, period=5.0)
+        run.draw('loop.png')
 
     :param plant: at the start; its present time is that of the first sample.
     :param events: events with their times; those of the same time in the given order.
@@ -191,7 +229,7 @@ def simulate(controller: Controller, plant: Plant, events: Iterable[ScheduledCha
         if stop is not None and stop(x, rows[-1][4], report):
             break
     times, states, measured, inputs, commands, setpoints = map(np.array, zip(*rows, strict=True))
-    return Simulation(times, states, measured, inputs, commands, setpoints, tuple(reports),
+    return LoopRun(times, states, measured, inputs, commands, setpoints, tuple(reports),
                       failure, loop)
 
 

@@ -16,7 +16,7 @@ from koopman_ros.control.events import Initialisation, ManualCommand, ModeChange
 from koopman_ros.control.laws import Feedback, feedback, Form, LAWS, Weights
 from koopman_ros.core.signals import Outputs
 from koopman_ros.core.solvers import solve_riccati
-from koopman_ros.evaluation.simulate import at, exchange, restart, run_closed_loop, simulate
+from koopman_ros.evaluation.loop import at, exchange, restart, run_closed_loop, run_loop
 from koopman_ros.model import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import (
     Actuator,
@@ -91,7 +91,7 @@ def process(case: Case) -> Process:
 
 def run(case: Case, *events, law='sdre', bandwidth=0.0, samples=60, plant=None, **others):
     """Simulate a case from its start to its goal, unless other things are to happen."""
-    return simulate(
+    return run_loop(
         controller(case, law, bandwidth), plant or process(case),
         events or [at(0.0, SetpointRequest(0, case.goal))], period=case.seconds,
         duration=samples * case.seconds, **others)
@@ -133,7 +133,7 @@ def test_rows_reproduce_the_run_of_the_plant(case):
 def test_a_simulation_in_two_parts_is_the_same(case):
     whole, first = run(case, samples=12), run(case, samples=4)
     plant = first.loop.plant.until(round(5 * case.seconds * 1e9))
-    second = simulate(first.loop.controller, plant, period=case.seconds,
+    second = run_loop(first.loop.controller, plant, period=case.seconds,
                       duration=7 * case.seconds, state=first.loop.state)
     for name in ('states', 'commands', 'setpoints', 'inputs'):
         np.testing.assert_array_equal(
@@ -147,7 +147,7 @@ def test_outputs_in_other_units_give_the_same_loop(case):
     C = np.diag(1.0 + np.arange(float(case.model.n_x))) * 4.0
     usual = run(case, samples=20)
     names = tuple(f'y{k}' for k in range(case.model.n_x))
-    found = simulate(
+    found = run_loop(
         replace(controller(case), outputs=Outputs(names, names, C)), process(case),
         [at(0.0, SetpointRequest(0, case.goal))], period=case.seconds,
         duration=20 * case.seconds)
@@ -159,12 +159,12 @@ def test_a_plant_with_more_states_than_the_model_needs_the_measured_names():
     plant = two_state_reactor()
     there = Process(plant, 0, plant.nominal_state, plant.nominal_input)
     case = CASES['reactor_nz4']
-    found = simulate(controller(case), there, duration=3.0, C=np.array([[0.0, 1.0]]))
+    found = run_loop(controller(case), there, duration=3.0, C=np.array([[0.0, 1.0]]))
     np.testing.assert_array_equal(found.measured, found.states[:, 1:])
     with pytest.raises(ValueError, match=r'plant has 2 states and the model 1: give C \(1, 2\)'):
-        simulate(controller(case), there, duration=3.0)
+        run_loop(controller(case), there, duration=3.0)
     with pytest.raises(ValueError, match=r'incompatible C: expected \(1, 2\) .* got \(2, 2\)'):
-        simulate(controller(case), there, duration=3.0, C=np.eye(2))
+        run_loop(controller(case), there, duration=3.0, C=np.eye(2))
 
 
 @each_case
@@ -244,7 +244,7 @@ def test_an_event_at_the_time_of_a_sample_is_of_that_sample():
     """3 x 0.7 s is less than 2.1 s in floating-point numbers."""
     case = CASES['reactor_nz4']
     there = Process(case.plant, 0, case.goal, case.held)
-    found = simulate(
+    found = run_loop(
         controller(case), there, [at(0.0, Initialisation(case.held)), *(
             at(seconds, ModeChange(mode)) for seconds, mode in (
                 (2.1, Mode.MANUAL), (4.2, Mode.AUTOMATIC)))], period=0.7, duration=5.6)
@@ -292,7 +292,7 @@ def test_a_simulation_ends_at_its_time_and_where_the_plant_cannot_continue():
 def test_arguments_that_make_no_sense_are_rejected(change, message):
     case = CASES['reactor_nz4']
     with pytest.raises(ValueError, match=message):
-        simulate(controller(case), process(case), **{'duration': 5.0, **change})
+        run_loop(controller(case), process(case), **{'duration': 5.0, **change})
 
 
 # A law in continuous time, against the analytic cost of the linear regulator.

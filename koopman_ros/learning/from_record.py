@@ -1,0 +1,69 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Learning from a record that was read: what command line, scripts and notebooks call."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+from koopman_ros.core.arrays import expect
+from koopman_ros.core.message_fields import place
+from koopman_ros.learning.pipeline import retrain
+from koopman_ros.learning.pipeline_progress import OnProgress
+from koopman_ros.learning.task import TrainingTask
+from koopman_ros.learning.training_result import TrainingResult
+from koopman_ros.model_classes import BEST
+from koopman_ros.records import Record, RecordedInput, RecordedState
+
+_OF_RECORD = ('bags', 'states', 'inputs')  # fields of a task that the record has
+
+
+def learn(record: Record, *, test: Record | None = None, disturbances: Sequence[str] = (),
+          unmeasured_states: int = -1, dead_time: Mapping[str, float] | None = None,
+          model_class: str = BEST, seed: int = 0, on_progress: OnProgress | None = None,
+          **settings: Any) -> TrainingResult:
+    """
+    Learn a model of a record, and judge it.
+
+    Dead times, unmeasured states and the equations are found from the record, a lift is learned
+    of them, and closed loops and a free run of the record judge it: what the program `learn`, the
+    trainer node and the panel do. Nothing is written. Example::
+
+        record = read('log.csv', ['temperature [degC]'], ['heater [percent]'])
+        result = learn(record)
+        print(result)
+        result.save('heater.safetensors')
+
+    :param record: measurements, of :func:`read`.
+    :param test: record of the same signals that takes no part in the training.
+    :param disturbances: those of its inputs that are measured, not manipulated.
+    :param unmeasured_states: number of states that are not in the record; -1: as many as it needs.
+    :param dead_time: of inputs by name, in s; of those not named it is found.
+    :param model_class: to learn, e.g. ``'linear'``; by default the one that the rule selects.
+    :param seed: of the split and of the training.
+    :param on_progress: called with the share done and a text; True stops the training.
+    :param settings: further fields of :class:`TrainingTask`, e.g. ``lag`` or ``physical_model``.
+    :raises TypeError: for an unknown setting, or a record that is none.
+    :raises ValueError: for a record that does not determine a model, or settings that do not fit.
+    """
+    expect(record=(record, Record))
+    if test is not None:
+        expect(test=(test, Record))
+    known = sorted({one.name for one in fields(TrainingTask)} - set(_OF_RECORD))
+    if unknown := ', '.join(name for name in settings if name not in known):
+        raise TypeError(f'unknown setting {unknown}: choose from {", ".join(known)}')
+    about = record.plant
+    # tables have no topics: those that the names would usually have stand for them
+    states = tuple(RecordedState(name, unit, place(name, name, unit)) for name, unit in zip(
+        about.state_names, about.state_units, strict=True))
+    inputs = tuple(RecordedInput(name, unit, place(name, name, unit)) for name, unit in zip(
+        about.input_names, about.input_units, strict=True))
+    task = TrainingTask(**{
+        'output': '', 'model': '', 'plant': about.name, 'bags': record.sources, 'states': states,
+        'inputs': inputs, 'disturbances': tuple(disturbances), 'model_class': model_class,
+        'unmeasured_states': unmeasured_states, 'dead_time': dict(dead_time or {}), 'seed': seed,
+        **settings})
+    return retrain(task, on_progress, record=record, test=test)
