@@ -227,7 +227,7 @@ for i in range(2):
 for panel in panels:
     panel.axvline(LEAK_AT, color='tab:red', linewidth=1.0, label='leak begins')
     panel.grid(alpha=0.3)
-panels[0].set_title('level_2 off its set-point at last: ' + ', '.join(
+panels[0].set_title('offset of level_2 at the end: ' + ', '.join(
     f'{name} {1e3 * off[1][1]:+.1f} mm' for name, off in offsets.items()), fontsize=9)
 panels[3].set(xlabel='time [s]', xlim=(0.0, 400.0))
 legend(figure, panels, 6)

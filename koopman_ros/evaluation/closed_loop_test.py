@@ -144,7 +144,8 @@ class ClosedLoopTest:
         counts = ((int(np.sum(failed & self.no_gain)), 'without a gain'),
                   (int(np.sum(failed & lost & ~self.no_gain)), 'without reaching the set-point'),
                   (int(np.sum(failed & ~lost)),
-                   f'at over {self.settings.most_excess:g} times the cost with a perfect model'))
+                   f'by costing over {self.settings.most_excess:g} times what a perfect model '
+                   'would'))
         return f'{text} ({", ".join(f"{n} {what}" for n, what in counts if n)}), {self.region}'
 
     def __repr__(self) -> str:

@@ -200,7 +200,8 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | 
         squares = np.where(missing, 0.0, errors ** 2).sum(axis=0)
     squares = np.where(np.isfinite(squares), squares, np.inf)
     spread = np.nansum((values - np.nanmean(values, axis=0)) ** 2, axis=0)
-    free_run = FreeRun(some.names, some.units, record.plant, episodes, paths, init, disturbances,
+    free_run = FreeRun(some.names, some.units, record.plant, episodes, paths, max(inits),
+                       disturbances,
                        np.sqrt(squares / np.sum(~missing, axis=0)),
                        100.0 * (1.0 - np.sqrt(squares / spread)))
     if picture:

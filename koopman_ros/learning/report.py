@@ -36,7 +36,7 @@ def write_report(retrained: TrainingResult) -> list[Path]:
         run.draw(path)
         pictures[f'Free run on the {name}'.replace('test', 'test record')] = path
     written = [write_figures(base.with_suffix('.json'), retrained.summary()),
-               write_page(base.with_suffix('.md'), 'Retraining',
+               write_page(base.with_suffix('.md'), _title(retrained),
                           [*_sections(retrained),
                            *(f'![{title}]({path.name})' for title, path in pictures.items()
                              if drawn)],
@@ -54,6 +54,14 @@ def reported(retrained: TrainingResult) -> tuple[dict[str, Any], tuple[str, ...]
         # the lift is written already
         warnings.append(f'the report could not be written: {error}')
     return {**retrained.summary(), 'warnings': warnings}, files
+
+
+def _title(retrained: TrainingResult) -> str:
+    """Name the training by its plant and record."""
+    kind = 'Training' if retrained.present is None else 'Retraining'
+    names = [Path(one).name for one in map(str, retrained.task.bags)]
+    return f'{kind} of {retrained.task.plant or "the plant"}' + (
+        f' from {names[0]}' if len(names) == 1 else f' from {len(names)} records' if names else '')
 
 
 def _sections(retrained: TrainingResult) -> Iterator[str]:
@@ -198,7 +206,7 @@ def _draw(path: Path, retrained: TrainingResult) -> bool:
                     row[3].set_ylim(low, high + 0.2 * (high - low))  # room for the legend
                     row[3].legend(fontsize=8, loc='upper left')
             word = 'accepted' if retrained.accepted else 'rejected'
-            figure.suptitle(f'Retraining: the new model is {word}')
+            figure.suptitle(f'{_title(retrained)}: the new model is {word}')
     except ImportError:
         return False
     return True
@@ -248,7 +256,7 @@ def _draw_drift(axes: Any, retrained: TrainingResult, i: int) -> None:
                  label='estimated from the data')
     axes.set(xlabel=_label(box.states, i),
              ylabel=f'difference of the rate [{box.states.units[i]}/{retrained.plant.time_unit}]',
-             title='rate in the middle of the range minus the estimate')
+             title='rate with the others in the middle: difference from the estimate')
     axes.legend()
 
 
