@@ -70,7 +70,7 @@ class RecedingHorizon(Law):
         self.planner: Planner | None = None
         self._unusable: Reason | None = None
         try:
-            from koopman_ros.control.mpc import planner
+            import koopman_ros.control.mpc.planner as planner
         except ImportError:
             self._unusable = reason(StatusCode.PACKAGE_MISSING, package=_PACKAGE)
             return
