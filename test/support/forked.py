@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 from typing import Any, BinaryIO
+from unittest import mock
 
 from koopman_ros import process_entry
 
@@ -59,8 +60,9 @@ def start(command: Sequence[str], *, stdout: BinaryIO, env: Mapping[str, str], *
     if tuple(command[:3]) != _CHILD:
         return subprocess.Popen(command, stdout=stdout, env=env, **others)
     resource_tracker.ensure_running()
-    with process_entry.blocked_signals():
-        # as in each process that is forked from the server, until it handles them
+    # signals are blocked in each process that is forked from the server until it handles them, and
+    # its BLAS has one thread, as that of a node
+    with process_entry.blocked_signals(), mock.patch.dict(os.environ, process_entry.ONE_THREAD):
         forkserver.ensure_running()
     return ForkedProcess(command, stdout.name, env)
 
