@@ -14,7 +14,7 @@ From a table to a closed loop, without ROS:
 ``Controller``, ``State``                 the controller: a function of a state and a measurement
 ``Tuning``, ``InputLimits``,              its weights and limits
 ``SensorLimits``
-``SetpointRequest``, ``at``               what an operator asks for, and when
+``SetpointRequest``, ``at``               set-points, and their times
 ``run_loop``, ``LoopRun``                 a controller on a simulated plant, and its picture
 ``Process``, ``build``                    simulated plants
 ``export_c``                              the loop as C code

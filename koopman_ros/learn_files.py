@@ -109,7 +109,7 @@ def command_parser() -> argparse.ArgumentParser:
 
 
 def _next(file: str, accepted: bool) -> str:
-    """Say what can be done with a model."""
+    """Return the next steps in words."""
     if not accepted:
         return ('change the record or the options as the reasons say; '
                 'docs/how-to/tune_training.md explains each')

@@ -144,8 +144,7 @@ class ClosedLoopTest:
         counts = ((int(np.sum(failed & self.no_gain)), 'without a gain'),
                   (int(np.sum(failed & lost & ~self.no_gain)), 'without reaching the set-point'),
                   (int(np.sum(failed & ~lost)),
-                   f'by costing over {self.settings.most_excess:g} times what a perfect model '
-                   'would'))
+                   f'by a cost over {self.settings.most_excess:g} times that of a perfect model'))
         return f'{text} ({", ".join(f"{n} {what}" for n, what in counts if n)}), {self.region}'
 
     def __repr__(self) -> str:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Learning from a record that was read: what command line, scripts and notebooks call."""
+"""Learning from a record, for the command line, scripts and notebooks."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def learn(record: Record, *, test: Record | None = None, disturbances: Sequence[
     Learn a model of a record, and judge it.
 
     Dead times, unmeasured states and the equations are found from the record, a lift is learned
-    of them, and closed loops and a free run of the record judge it: what the program `learn`, the
-    trainer node and the panel do. Nothing is written. Example::
+    of them, and closed loops and a free run of the record judge it, as in the program `learn`, the
+    trainer node and the panel. Nothing is written. Example::
 
         record = read('log.csv', ['temperature [degC]'], ['heater [percent]'])
         result = learn(record)

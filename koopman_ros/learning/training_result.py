@@ -65,7 +65,7 @@ class TrainingResult:
     _repr_pretty_ = show_printed
 
     def __str__(self) -> str:
-        """Show what was found, the verdict, the free runs and the warnings."""
+        """Show the structure, the verdict, the free runs and the warnings."""
         return '\n'.join([
             f'{self.task.plant}: {self.found_text}: '
             + ('accepted' if self.accepted else 'rejected'),
@@ -87,7 +87,7 @@ class TrainingResult:
 
     @property
     def found_text(self) -> str:
-        """What was found in the record, in a line."""
+        """Structure, unmeasured states, dead times and lags, in a line."""
         hidden, names = self.found.hidden, self.found.drift.box.inputs.names
         late = [f'{what} {seconds:.4g} s of {name}' for what, values in (
             ('dead time', self.dead_time), ('lag', self.lag))

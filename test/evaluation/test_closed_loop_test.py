@@ -179,7 +179,7 @@ def test_a_costly_law_is_rejected_by_its_cost():
     assert found.ratios == pytest.approx(np.full(16, expected), rel=1e-4)
     # of a linear plant it is the same law
     assert found.excess == pytest.approx(found.ratios, rel=1e-4)
-    assert '(16 by costing over 1.05 times what a perfect model would)' in str(found)
+    assert '(16 by a cost over 1.05 times that of a perfect model)' in str(found)
 
 
 def test_setpoints_out_of_reach_within_limits_are_judged_without_limits():
@@ -253,7 +253,7 @@ def test_a_cost_that_a_better_model_would_save_counts_against_a_model():
     assert alone.any()
     assert (found.ratios[alone] == 0.0).all()
     assert found.arrived == found.loops - alone.sum()
-    assert 'by costing over 1.05 times what a perfect model would' in str(found)
+    assert 'by a cost over 1.05 times that of a perfect model' in str(found)
 
 
 def test_a_model_keeps_the_loops_in_which_its_law_is_lost():

@@ -356,7 +356,7 @@ def test_noise_that_is_coloured_is_named(found, trained, shipped, colour):
     if not colour:
         assert decision.warnings == ()
         return
-    match = re.search(r'temperature is coloured \(autocorrelation (0\.\d\d).* (\d+) % of its '
+    match = re.search(r'temperature is coloured \(autocorrelation (0\.\d\d).* (\d+) % of the '
                       'samples', decision.warnings[0])
     # of three segments of 60 samples, whose starts are fitted
     r = float(match[1])

@@ -112,7 +112,7 @@ def test_noise_neither_hides_an_error_nor_makes_one(bend, chosen):
 @pytest.fixture
 def monomials_judged(monkeypatch):
     """Judge the condition number of a polynomial, too, so that a simple class is rejected."""
-    monkeypatch.setattr('koopman_ros.learning.acceptance.PolynomialObservables', ())
+    monkeypatch.setattr('koopman_ros.learning.acceptance.held_out.PolynomialObservables', ())
 
 
 @pytest.mark.usefixtures('monomials_judged')

@@ -293,8 +293,8 @@ def test_trainer(ros: Harness, tmp_path: Path) -> None:
     assert change(ros, 'trainer', 'deactivate')
     ros.node.destroy_timer(timer)
     ros.wait_until(lambda: ros.node.count_publishers(reactor.COOLANT_SETPOINT) == 0)
+    ros.wait_until(lambda: loop.commands[-1].temperature == pytest.approx(18.85))
     count = len(loop.commands)
-    assert loop.commands[-1].temperature == pytest.approx(18.85)
     assert all(abs(b.temperature - a.temperature) <= 1.0 + 1e-9
                for a, b in pairwise(loop.commands))
     assert summary(bag).complete

@@ -468,6 +468,8 @@ def test_an_entry_is_operated_by_keys_and_refuses_an_ambiguous_number(desk: Desk
     with desk.page() as (loop, page):
         ready(page)
         own = face(page, 'temperature')
+        # an arrow moves a number, so that there has to be one
+        expect(asked(page)).to_have_value('45.0')
         asked(page).press('ArrowUp')
         expect(asked(page)).to_have_value('45.1')
         asked(page).press('Escape')
