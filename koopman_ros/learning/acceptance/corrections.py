@@ -158,7 +158,7 @@ def correction_posterior(drift: Drift, own: OwnTerms, episodes: Sequence[Episode
         logs, factors, means = [], [], []
         for P in deviations:
             M = P[:, None] * G * P
-            # rounding of a product that the record tells a thousand times over hides the 1
+            # rounding errors are relative to the largest element, and may exceed the 1
             L = np.linalg.cholesky(M + (1.0 + 1e-12 * np.max(np.diag(M))) * np.eye(width))
             z = np.linalg.solve(L, P * b)
             logs.append(0.5 * z @ z - np.log(np.diag(L)).sum())
