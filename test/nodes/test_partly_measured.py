@@ -75,6 +75,8 @@ def test_a_lift_with_a_hidden_state_takes_over_from_a_pi_law_without_offset(
     # a busy machine controls less often, and takes longer
     ros.wait_until(lambda: len(measured) > begun + 400 and np.mean([
         message.temperature for message in measured[-200:]]) == pytest.approx(SETPOINT, abs=0.02))
+    # a sample that a busy machine missed has no estimate
+    ros.wait_until(lambda: 'estimated_concentration [mol/L]' in internals[-1].name)
     said = dict(zip(internals[-1].name, internals[-1].position, strict=True))
     truth = steady_state(two_state_reactor(ReactorParameters(feed_temperature=FEED)),
                          {'temperature': to_kelvin(SETPOINT)})[0][0]
