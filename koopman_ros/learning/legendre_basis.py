@@ -14,6 +14,7 @@ from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 
 from koopman_ros.core.arrays import Array, short_repr
+from koopman_ros.model import Box
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,23 @@ class LegendreBasis:
     def degrees(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Degree of each product in the states (p,), and in the inputs (p,)."""
         return (self.exponents[:, :self.n_x].sum(axis=1), self.exponents[:, self.n_x:].sum(axis=1))
+
+
+@dataclass(frozen=True)
+class Correction:
+    """An addition to a rate, by Legendre products of states and inputs."""
+
+    box: Box
+    basis: LegendreBasis
+    coefficients: Array  #: (p, n_x) in scaled deviations
+
+    __repr__ = short_repr
+
+    def __call__(self, x: Array, u: Array) -> Array:
+        """Evaluate the addition in units: (..., n_x) and (..., n_u) -> (..., n_x)."""
+        states, inputs = self.box.states, self.box.inputs
+        phi = self.basis(states.to_deviation(x), inputs.to_deviation(u))
+        return np.asarray(states.scale * (phi @ self.coefficients))
 
 
 def _exponents(count: int, degree: int) -> Sequence[tuple[int, ...]]:

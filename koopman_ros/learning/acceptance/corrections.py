@@ -26,7 +26,7 @@ from koopman_ros.core.integration import runge_kutta_step, sensitivity_rate
 from koopman_ros.learning.acceptance.settings import DEFAULTS, Thresholds
 from koopman_ros.learning.identification import Drift, fitted_starts, longest_step, Segments
 from koopman_ros.learning.identification.drift import prediction_error
-from koopman_ros.learning.legendre_basis import LegendreBasis
+from koopman_ros.learning.legendre_basis import Correction, LegendreBasis
 
 
 class OwnTerms(NamedTuple):
@@ -47,16 +47,9 @@ class PlausiblePlant:
     """An estimated drift with a correction that the record does not rule out."""
 
     drift: Drift
-    basis: LegendreBasis
-    coefficients: Array  #: (n_x, p)
+    correction: Correction
 
     __repr__ = short_repr
-
-    def correction(self, x: Array, u: Array) -> Array:
-        """Evaluate the addition to dx/dt in units: (..., n_x) and (..., n_u) -> (..., n_x)."""
-        states, inputs = self.drift.box.states, self.drift.box.inputs
-        added = self.basis(states.to_deviation(x), inputs.to_deviation(u)) @ self.coefficients.T
-        return np.asarray(states.scale * added)
 
     def rate(self, x: Array, u: Array) -> Array:
         """Evaluate dx/dt in units: (..., n_x) and (..., n_u) -> (..., n_x)."""
@@ -97,8 +90,9 @@ class CorrectionPosterior:
         rng = np.random.default_rng(seed)
         grid = rng.choice(len(self.weights), count, p=self.weights)
         noise = rng.standard_normal((count, self.means.shape[1]))
-        return tuple(PlausiblePlant(self.drift, self.basis, self._coefficients(
-            k, self.means[k] + noise[i])) for i, k in enumerate(grid))
+        return tuple(PlausiblePlant(self.drift, Correction(
+            self.drift.box, self.basis, self._coefficients(k, self.means[k] + noise[i]).T))
+            for i, k in enumerate(grid))
 
     def shares(self) -> Mapping[str, float]:
         """

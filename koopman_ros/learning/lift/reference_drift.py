@@ -12,7 +12,7 @@ import numpy as np
 from koopman_ros.core.arrays import Array, short_repr
 from koopman_ros.core.datasets import DriftSamples
 from koopman_ros.evaluation.closed_loop_test import Rate
-from koopman_ros.learning.legendre_basis import LegendreBasis
+from koopman_ros.learning.legendre_basis import Correction, LegendreBasis
 from koopman_ros.model import Box
 
 
@@ -32,27 +32,24 @@ class CorrectedRate:
     """A rate with corrections by Legendre products of states and inputs."""
 
     rate: Rate
-    box: Box
-    basis: LegendreBasis
-    coefficients: Array  #: (p, n_x) in scaled deviations
+    correction: Correction
 
     __repr__ = short_repr
 
     def __call__(self, x: Array, u: Array) -> Array:
         """Evaluate dx/dt in units: (..., n_x) and (..., n_u) -> (..., n_x)."""
-        states, inputs = self.box.states, self.box.inputs
-        phi = self.basis(states.to_deviation(x), inputs.to_deviation(u))
-        return self.rate(x, u) + states.scale * (phi @ self.coefficients)
+        return self.rate(x, u) + self.correction(x, u)
 
     @property
     def cause(self) -> str:
         """The missing structure in words, where it is an effect of the inputs."""
-        squares = np.sum(self.coefficients ** 2, axis=1)
-        nonlinear = self.basis.degrees[1] > 1
+        squares = np.sum(self.correction.coefficients ** 2, axis=1)
+        nonlinear = self.correction.basis.degrees[1] > 1
         if squares[nonlinear].sum() < squares[~nonlinear].sum():
             return ''
-        return (f'; the effect of {" or ".join(self.box.inputs.names)} is nonlinear: use the '
-                'quantity that acts as the input, or a narrower range')
+        names = ' or '.join(self.correction.box.inputs.names)
+        return (f'; the effect of {names} is nonlinear: use the quantity that acts as the input, '
+                'or a narrower range')
 
 
 def corrected(rate: Rate, box: Box, training: DriftSamples, validation: DriftSamples,
@@ -75,5 +72,5 @@ def corrected(rate: Rate, box: Box, training: DriftSamples, validation: DriftSam
     phi = basis(box.states.to_deviation(training.x), box.inputs.to_deviation(training.u))
     coefficients: Array = np.asarray(np.linalg.lstsq(
         phi, left(rate, training), rcond=None)[0], dtype=np.float64)
-    found = CorrectedRate(rate, box, basis, coefficients)
+    found = CorrectedRate(rate, Correction(box, basis, coefficients))
     return found if size(left(found, validation)) < settings.improvement * error else rate

@@ -102,7 +102,7 @@ def test_a_nonlinear_effect_of_the_input_is_found_and_named():
     u = np.linspace(-0.8, 0.8, 17)[:, None]
     x = np.zeros_like(u)
     added = found.draw(1)[0]
-    added = replace(added, coefficients=found.mean).correction(x, u)
+    added = replace(added.correction, coefficients=found.mean.T)(x, u)
     assert added[:, 0] == pytest.approx(0.5 * u[:, 0] ** 2, abs=0.03)
     missing = missing_structure(found)
     assert missing is not None
