@@ -1,24 +1,20 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``python -m koopman_ros learn``: the programs without ROS, where they are not on the path."""
+"""``python -m koopman_ros learn``: the program :mod:`koopman_ros.learn_files`."""
 
 import sys
 
 from koopman_ros import process_entry
 
-PROGRAMS = ('learn', 'export_c')
-
 
 def main() -> int:
-    """Run the program that the first argument names."""
-    name = sys.argv[1] if len(sys.argv) > 1 else ''
-    if name not in PROGRAMS:
-        print(f'usage: python -m koopman_ros {" | ".join(PROGRAMS)} ...', file=sys.stderr)
+    """Run the program, which the first argument names."""
+    if sys.argv[1:2] != ['learn']:
+        print('usage: python -m koopman_ros learn ...', file=sys.stderr)
         return 1
     del sys.argv[1]
-    code: int = getattr(process_entry, name)()
-    return code
+    return process_entry.learn()
 
 
 if __name__ == '__main__':

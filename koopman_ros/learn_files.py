@@ -114,7 +114,7 @@ def _next(file: str, accepted: bool) -> str:
         return ('change the record or the options as the reasons say; '
                 'docs/how-to/tune_training.md explains each')
     return (f"control by load('{file}') in Python (docs/tutorials/without_ros.md) or by the node "
-            f'(-p model:={file}), or write C code (python -m koopman_ros export_c {file})')
+            f'(-p model:={file}), or write C code (python -m koopman_ros.export {file})')
 
 
 def _loaded(model: str) -> LiftedModel | None:

@@ -97,7 +97,7 @@ def test_a_record_becomes_a_model_with_its_dead_time(result, tmp_path, monkeypat
     assert model.dead_time == pytest.approx([LATE * PERIOD])
     assert model.eigenvalues.real == pytest.approx([-0.2], rel=0.02)
     assert simulate(model, RECORD).fit == pytest.approx([99.9], abs=0.2)
-    # what was not asked for is not written
+    # no other file is written
     assert [path.name for path in tmp_path.iterdir()] == ['tank.safetensors']
 
 

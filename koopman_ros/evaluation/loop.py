@@ -230,7 +230,7 @@ def run_loop(controller: Controller, plant: Plant, events: Iterable[ScheduledCha
             break
     times, states, measured, inputs, commands, setpoints = map(np.array, zip(*rows, strict=True))
     return LoopRun(times, states, measured, inputs, commands, setpoints, tuple(reports),
-                      failure, loop)
+                   failure, loop)
 
 
 def _outputs(controller: Controller, plant: Plant, C: Array | None) -> Callable[[Array], Array]:

@@ -29,7 +29,7 @@ class RateBand:
     values: Array  #: (P, n_x) of each state
     rates: Array  #: (P, n_x) of the estimated drift there
     lower: Array  #: (P, n_x) end of the band
-    upper: Array  #: (P, n_x) likewise
+    upper: Array  #: (P, n_x) its upper end
 
     __repr__ = short_repr
 
