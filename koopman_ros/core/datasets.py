@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import hashlib
 import itertools
 
@@ -118,6 +118,8 @@ class Episode:
     u: Array  #: (M, n_u) those inputs, in input units
     #: (n_u,) whether each is linear between those times; empty where all are held
     linear: tuple[bool, ...] = ()
+    #: (n_x,) constant disturbance of the rates, in state units per time unit; empty for none
+    disturbance: Array = field(default_factory=lambda: np.zeros(0))
 
     __repr__ = short_repr
 
@@ -209,7 +211,7 @@ class Episode:
         for j, own in enumerate(shifted.T):
             u[:, j] = np.interp(knots, own, self.u[:, j]) if any(self.linear[j:j + 1]) else (
                 self.u[np.searchsorted(own, knots, side='right') - 1, j])
-        return Episode(self.time[first:], self.x[first:], knots, u, self.linear)
+        return replace(self, time=self.time[first:], x=self.x[first:], input_time=knots, u=u)
 
     def part(self, start: int, stop: int) -> Episode:
         """Return the measurements `start` to `stop` with the inputs that acted on them."""
@@ -218,7 +220,8 @@ class Episode:
         # a line needs its end, too
         last = np.searchsorted(self.input_time, time[-1], side='left') + any(self.linear)
         keep = slice(first, max(first + 1, last))
-        return Episode(time, self.x[start:stop], self.input_time[keep], self.u[keep], self.linear)
+        return replace(self, time=time, x=self.x[start:stop], input_time=self.input_time[keep],
+                       u=self.u[keep])
 
 
 def sample_interval(episodes: Sequence[Episode]) -> float:
@@ -255,9 +258,9 @@ def averaged(episode: Episode, count: int) -> Episode:
     x = episode.x[:n * count].reshape(n, count, -1).mean(axis=1)
     changes = np.sum((episode.input_time > time[0]) & (episode.input_time < time[-1]))
     if not any(episode.linear) and changes <= n:
-        return Episode(time, x, episode.input_time, episode.u).part(0, n)
+        return replace(episode, time=time, x=x).part(0, n)
     u = np.diff(episode.input_integral(time), axis=0) / np.diff(time)[:, None]
-    return Episode(time, x, time[:-1], u)
+    return replace(episode, time=time, x=x, input_time=time[:-1], u=u, linear=())
 
 
 def within(episodes: Sequence[Episode], lower: ArrayLike, upper: ArrayLike, samples: int = 2

@@ -59,7 +59,9 @@ def inconsistency(found: Identified) -> str:
     states: half of their difference is about the error of the drift of the whole record.
     """
     drift = found.drift
-    if found.hidden or found.constants or not isinstance(drift, DriftModel | NetworkDrift):
+    # offsets say already that its episodes differ
+    if found.hidden or found.constants or len(found.offsets) or (
+            not isinstance(drift, DriftModel | NetworkDrift)):
         return ''
     segments = sorted([*found.fitted, *found.held_out], key=lambda one: float(one.time[0]))
     halves = segments[:len(segments) // 2], segments[len(segments) // 2:]

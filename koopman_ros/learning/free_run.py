@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+import math
 import os
 from pathlib import Path
 from typing import TypeAlias
@@ -38,6 +39,9 @@ _LOST = 1e3  # error of a start that diverges, in half-ranges
 # The first samples of another day err by more than so many times the usual error. A steady state
 # that is a half-range elsewhere then counts as much as such an error of a sample.
 _OTHER_DAY = 1.5
+_INIT = 50  # samples to which a start is fitted
+# A disturbance is fitted to samples of so many slowest time constants: it shows no sooner.
+_MEMORIES = 2.0
 # A Runge-Kutta step of a sample, as in the identification, follows motion up to this angle in it;
 # of faster motion, it takes up to so many steps in two samples.
 _RESOLVED, _FINEST = 2.0, 50.0
@@ -134,8 +138,9 @@ class FreeRun:
             figure.suptitle('Free run')
 
 
-def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | None = None,
-             offsets: Array | None = None, picture: str | os.PathLike[str] = '') -> FreeRun:
+def simulate(model: AnyModel, record: Record, init: int | None = None, *,
+             usual: Array | None = None, offsets: Array | None = None,
+             picture: str | os.PathLike[str] = '') -> FreeRun:
     """
     Simulate a whole record by its inputs alone, and compare with the measurements.
 
@@ -146,7 +151,8 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | 
 
     :param model: a model, or anything that training or identification returns.
     :param record: with all inputs and at least one state of the model, in any units.
-    :param init: samples to which the start is fitted; at most half of an episode.
+    :param init: samples to which the start is fitted; at most half of an episode. By default 50,
+        and with a disturbance as many as two of the model's slowest time constants take, if more.
     :param usual: (n_y,) root mean square error of the model's free run over a record that it was
         learned from, in its units; by default that of the model itself. The first samples
         contradict the model where they err by more than 1.5 times that. Without it there is no
@@ -171,24 +177,20 @@ def simulate(model: AnyModel, record: Record, init: int = 50, *, usual: Array | 
     if not episodes:
         raise ValueError('no episode of the record is longer than the dead time of the model, '
                          f'{max(dead_time):g} {record.plant.time_unit}')
-    if init < 1:
+    if init is not None and init < 1:
         raise ValueError(f'init = {init} must be at least 1 sample')
     indexed = [replace(one, x=np.arange(1.0, 1 + len(one))[:, None]) for one in episodes]
     step = _step(rate, states, episodes)
-    inits = [max(1, min(init, len(one) // 2)) for one in episodes]
     if usual is None and offsets is None:
         usual = _usual(model, some.names)
     known = np.zeros((len(episodes), len(states))) if offsets is None else offsets
-
-    def under(offset: Array) -> Rate:
-        return lambda x, u: rate(x, u) + offset
-
-    found = [_start(under(own), states, measured, one, index, count, step, usual)
-             for one, index, count, own in zip(episodes, indexed, inits, known, strict=True)]
-    starts, disturbances = (np.array(some) for some in zip(*found, strict=True))
-    disturbances = disturbances + known
-    segments = Segments.of(indexed, step)
-    run = segments.path(rate, starts, disturbances)
+    indexed = [replace(one, disturbance=own) for one, own in zip(indexed, known, strict=True)]
+    found = [_start(rate, states, measured, one, index, init, step, usual)
+             for one, index in zip(episodes, indexed, strict=True)]
+    starts, disturbances = (np.array([one[k] for one in found]) for k in range(2))
+    inits, disturbances = [one[2] for one in found], disturbances + known
+    segments = replace(Segments.of(indexed, step), disturbance=disturbances)
+    run = segments.path(rate, starts)
     paths = tuple(run[np.flatnonzero(segments.x[:, k, 0])[:len(one)], k][:, order]
                   for k, one in enumerate(episodes))
     errors, values = (np.concatenate(parts) for parts in (
@@ -268,51 +270,80 @@ def _of_record(rate: Rate, states: Coordinates, inputs: Coordinates
 
 
 def _start(rate: Rate, states: Coordinates, measured: Sequence[int], episode: Episode,
-           indexed: Episode, count: int, step: float, usual: Array | None
-           ) -> tuple[Array, Array]:
-    """Return the start (n_x,) that fits the first samples best, and a disturbance (n_x,)."""
-    segments = Segments.of([indexed.part(0, count)] if count > 1 else [indexed.part(0, 2)], step)
-    rows = np.flatnonzero(segments.x[:, 0, 0])[:count]
-    y = states.only([states.names[i] for i in measured]).to_deviation(episode.x[:count])
-    present, n_x = ~np.isnan(y), len(states)
-    home, memory = np.zeros(n_x), 1.0
-    for i, column, seen in zip(measured, y.T, present.T, strict=True):
-        if seen.any():
-            home[i] = column[seen][0]
-
-    def disturbance(p: Array) -> Array:
-        """Return that (S, n_x) of parameters (S, n_x or n_x + n_y), in state units."""
-        found = np.zeros((len(p), n_x))
-        found[:, measured] = (p[:, n_x:] if p.shape[1] > n_x else 0.0) / memory
-        return found * states.scale
-
-    def errors(p: Array) -> Array:
-        """Return the errors (S, m) from starts (S, n_x), side by side, in half-ranges."""
-        path = segments.repeated(len(p)).path(
-            rate, states.to_physical(p[:, :n_x]), disturbance(p))
-        found = states.to_deviation(path[rows])[..., measured] - y[:, None]
-        return np.hstack((np.clip(np.nan_to_num(
-            np.swapaxes(found, 0, 1)[:, present], nan=_LOST), -_LOST, _LOST), p[:, n_x:]))
-
-    def fitted(start: Array) -> OptimizeResult:
-        def slopes(p: Array) -> Array:
-            reference, *others = errors(p + 1e-4 * np.vstack([np.zeros(len(p)), np.eye(len(p))]))
-            return np.transpose(np.subtract(others, reference)) / 1e-4
-
-        return least_squares(lambda p: errors(p[None])[0], start, slopes, max_nfev=_EVALUATIONS)
-
+           indexed: Episode, init: int | None, step: float, usual: Array | None
+           ) -> tuple[Array, Array, int]:
+    """Return the start (n_x,) that fits the first samples best, a disturbance (n_x,), and them."""
+    most, n_x = max(1, len(episode) // 2), len(states)
+    count = min(_INIT if init is None else init, most)
+    first = _FirstSamples(rate, states, measured, episode, indexed, count, step)
     hidden = [i for i in range(n_x) if i not in measured]
     shifts = [np.zeros(n_x), *(guess * row for row in np.eye(n_x)[hidden]
                                for guess in _GUESSES)]
-    best = min((fitted(home + shift) for shift in shifts), key=lambda one: float(one.cost)).x
-    if usual is not None:
-        squares = np.zeros(present.shape)
-        squares[present] = errors(best[None])[0] ** 2
-        scale = usual / states.scale[measured]
-        if np.sqrt(np.mean(np.mean(squares, axis=0) / scale ** 2)) > _OTHER_DAY:
-            memory = _memory(rate, states, states.to_physical(best), episode)
-            best = fitted(np.append(best, np.zeros(len(measured)))).x
-    return states.to_physical(best[:n_x]), disturbance(best[None])[0]
+    best = min((first.fitted(first.home + shift) for shift in shifts),
+               key=lambda one: float(one.cost)).x
+    if usual is not None and first.error(best, usual / states.scale[measured]) > _OTHER_DAY:
+        memory = _memory(rate, states, states.to_physical(best), episode)
+        if init is None:
+            period = float(np.median(np.diff(episode.time)))
+            count = max(count, min(math.ceil(_MEMORIES * memory / period), most))
+        first = _FirstSamples(rate, states, measured, episode, indexed, count, step, memory)
+        best = first.fitted(np.append(best, np.zeros(len(measured)))).x
+    return states.to_physical(best[:n_x]), first.disturbance(best[None])[0], count
+
+
+class _FirstSamples:
+    """
+    Errors of simulations from different starts over the first samples of an episode.
+
+    :param memory: time constant, in which disturbances are counted.
+    :ivar home: start (n_x,) as measured, in deviations.
+    """
+
+    def __init__(self, rate: Rate, states: Coordinates, measured: Sequence[int], episode: Episode,
+                 indexed: Episode, count: int, step: float, memory: float = 1.0) -> None:
+        self._rate, self._states, self._measured = rate, states, measured
+        self._memory, self._known = memory, indexed.disturbance
+        self._segments = Segments.of([indexed.part(0, max(2, count))], step)
+        self._rows = np.flatnonzero(self._segments.x[:, 0, 0])[:count]
+        self._y = states.only([states.names[i] for i in measured]).to_deviation(episode.x[:count])
+        self._present = ~np.isnan(self._y)
+        self.home = np.zeros(len(states))
+        for i, column, seen in zip(measured, self._y.T, self._present.T, strict=True):
+            if seen.any():
+                self.home[i] = column[seen][0]
+
+    def disturbance(self, p: Array) -> Array:
+        """Return that (S, n_x) of parameters (S, n_x or n_x + n_y), in state units."""
+        n_x = len(self._states)
+        found = np.zeros((len(p), n_x))
+        found[:, self._measured] = (p[:, n_x:] if p.shape[1] > n_x else 0.0) / self._memory
+        return found * self._states.scale
+
+    def errors(self, p: Array) -> Array:
+        """Return the errors (S, m) from starts (S, n_x), side by side, in half-ranges."""
+        n_x = len(self._states)
+        path = replace(
+            self._segments.repeated(len(p)), disturbance=self._known + self.disturbance(p)
+            ).path(self._rate, self._states.to_physical(p[:, :n_x]))
+        found = self._states.to_deviation(path[self._rows])[..., self._measured] - self._y[:, None]
+        return np.hstack((np.clip(np.nan_to_num(
+            np.swapaxes(found, 0, 1)[:, self._present], nan=_LOST), -_LOST, _LOST), p[:, n_x:]))
+
+    def fitted(self, start: Array) -> OptimizeResult:
+        """Return the best parameters near others, as SciPy does."""
+        def slopes(p: Array) -> Array:
+            reference, *others = self.errors(
+                p + 1e-4 * np.vstack([np.zeros(len(p)), np.eye(len(p))]))
+            return np.transpose(np.subtract(others, reference)) / 1e-4
+
+        return least_squares(lambda p: self.errors(p[None])[0], start, slopes,
+                             max_nfev=_EVALUATIONS)
+
+    def error(self, start: Array, usual: Array) -> float:
+        """Return the root mean square error from a start, in usual ones (n_y,) in deviations."""
+        squares = np.zeros(self._present.shape)
+        squares[self._present] = self.errors(start[None])[0] ** 2
+        return float(np.sqrt(np.mean(np.mean(squares, axis=0) / usual ** 2)))
 
 
 def _memory(rate: Rate, states: Coordinates, x: Array, episode: Episode) -> float:

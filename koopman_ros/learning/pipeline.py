@@ -137,7 +137,8 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     # commands are no states of a record
     offsets = offsets[:, :offsets.shape[1] - len(estimate.as_state)]
     runs = _free_runs(learned, recorded, test, offsets)
-    others = {name: _free_runs(replace(found, drift=drift), recorded, test, offsets)
+    init = runs['test'].init if test else None
+    others = {name: _free_runs(replace(found, drift=drift), recorded, test, offsets, init)
               for name, drift in ((DRIFT, found.drift), (LINEAR_MODEL, found.linear))}
     decision = replace(decision, reasons=(
         *decision.reasons, *_failed_runs(runs, others)), warnings=(
@@ -186,12 +187,12 @@ def _read(backend: Backend, task: TrainingTask, states: Sequence[RecordedState],
                        tick=progress.reading(2 * source.size()), backend=backend)
 
 
-def _free_runs(model: AnyModel, recorded: Record, test: Record | None, offsets: Array
-               ) -> dict[str, FreeRun]:
+def _free_runs(model: AnyModel, recorded: Record, test: Record | None, offsets: Array,
+               init: int | None = None) -> dict[str, FreeRun]:
     """Simulate the record, with the offset of each episode, and the test record."""
     runs = {'record': simulate(model, recorded, offsets=offsets)}
     if test is not None:
-        runs['test'] = simulate(model, test, usual=runs['record'].rmse)
+        runs['test'] = simulate(model, test, init, usual=runs['record'].rmse)
     return runs
 
 

@@ -24,14 +24,14 @@ STATES = Coordinates.spanning(('position', 'speed'), ('m', 'm/s'), -2.0 * np.one
 INPUTS = Coordinates.spanning(('force',), ('N',), -np.ones(1), np.ones(1))
 
 
-def table(seed=0, x=(1.0, -0.5), push=0.0):
+def table(seed=0, x=(1.0, -0.5), push=0.0, period=PERIOD):
     """Return a run of the oscillator under random steps and a push, solved exactly."""
-    step, gain = sampled(A, B, PERIOD)
+    step, gain = sampled(A, B, period)
     u = np.repeat(np.random.default_rng(seed).uniform(-1.0, 1.0, N // 10), 10)
     path = [np.array(x)]
     for value in u[:-1]:
         path.append(step @ path[-1] + gain[:, 0] * (value + push))
-    return {'time': PERIOD * np.arange(N), 'force': u,
+    return {'time': period * np.arange(N), 'force': u,
             **dict(zip(STATES.names, np.transpose(path), strict=True))}
 
 
@@ -162,6 +162,18 @@ def test_a_constant_disturbance_is_found_where_the_first_samples_contradict(push
                      offsets=np.array([[0.0, push]]))
     assert known.disturbances.tolist() == [[0.0, push]]
     assert np.all(known.fit > 99.9)
+
+
+@pytest.mark.parametrize(('period', 'init', 'count'), [
+    (0.1, None, 50), (0.025, None, 80), (0.01, None, 100), (0.025, 30, 30)])
+def test_a_disturbance_is_fitted_to_two_time_constants(period, init, count):
+    # of 1 s, in half of the record at most
+    run = simulate(lifted(), read(table(push=0.5, period=period), [
+        'position [m]', 'speed [m/s]'], 'force [N]'), init, usual=np.full(2, 0.001))
+    assert run.init == count
+    without = simulate(lifted(), read(table(period=period), [
+        'position [m]', 'speed [m/s]'], 'force [N]'), usual=np.full(2, 0.001))
+    assert without.init == 50
 
 
 @pytest.mark.parametrize(('signals', 'options', 'words'), [

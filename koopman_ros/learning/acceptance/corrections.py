@@ -111,13 +111,11 @@ class CorrectionPosterior:
 
 
 def correction_posterior(drift: Drift, own: OwnTerms, episodes: Sequence[Episode],
-                         settings: Thresholds = DEFAULTS, *, offsets: bool = False,
-                         seed: int = 0) -> CorrectionPosterior:
+                         settings: Thresholds = DEFAULTS, *, seed: int = 0) -> CorrectionPosterior:
     """
     Return the distribution of the corrections of a drift, given the episodes of a record.
 
     :param own: terms that the drift has itself.
-    :param offsets: whether each episode has a constant rate of its own.
     :param seed: of the choice of segments of a long record.
     :raises ValueError: where the free runs of the drift follow no part of the record.
     """
@@ -133,7 +131,7 @@ def correction_posterior(drift: Drift, own: OwnTerms, episodes: Sequence[Episode
     room = np.cumsum([per_sample * len(parts[k]) for k in order]) <= settings.most_numbers
     room[0] = True
     segments = Segments.of([parts[k] for k in np.sort(order[room])], longest_step(parts))
-    pieces, followed = _linearised(drift, basis, segments, settings, offsets)
+    pieces, followed = _linearised(drift, basis, segments, settings)
     if not pieces:
         raise ValueError('the free runs of the estimated drift follow no part of the record: '
                          'record an input or a state that is missing')
@@ -171,7 +169,7 @@ class _Piece(NamedTuple):
 
     residuals: tuple[Array, ...]  #: of each state (N_i,)
     sensitivities: tuple[Array, ...]  #: (N_i, n_x p) to the coefficients
-    nuisances: tuple[Array, ...]  #: (N_i, q) to the start, and to an offset of the rate
+    starts: tuple[Array, ...]  #: (N_i, n_x) to the start
 
 
 def _pieces(drift: Drift, episodes: Sequence[Episode], settings: Thresholds) -> list[Episode]:
@@ -196,15 +194,15 @@ def _samples(drift: Drift, segments: Segments) -> tuple[Array, Array]:
             drift.box.inputs.to_deviation(segments.u)[inside])
 
 
-def _linearised(drift: Drift, basis: LegendreBasis, segments: Segments, settings: Thresholds,
-                offsets: bool) -> tuple[list[_Piece], float]:
+def _linearised(drift: Drift, basis: LegendreBasis, segments: Segments, settings: Thresholds
+                ) -> tuple[list[_Piece], float]:
     """Integrate the free runs with their sensitivities; return those that follow the record."""
     states, n, p = drift.box.states, len(drift.box.states), len(basis.exponents)
     x0 = fitted_starts(drift.rate, segments, states.scale)[0]
     M, width = len(x0), n * p
     y = np.zeros((M, n, 1 + width + n))
     y[..., 0], y[..., 1 + width:] = states.to_deviation(x0), np.eye(n)
-    path = [y]
+    path, disturbance = [y], segments.disturbance / states.scale
     for k in range(len(segments.steps)):
         v = drift.box.inputs.to_deviation(segments.u[k])
 
@@ -216,14 +214,13 @@ def _linearised(drift: Drift, basis: LegendreBasis, segments: Segments, settings
             return found
 
         def rate_and_slope(xi: Array, v: Array = v) -> tuple[Array, Array]:
-            return drift.scaled_rate(xi, v), drift.scaled_slope(xi, v)
+            return drift.scaled_rate(xi, v) + disturbance, drift.scaled_slope(xi, v)
 
         y = runge_kutta_step(sensitivity_rate(rate_and_slope, forcing), y,
                              segments.steps[k][:, None, None])
         path.append(y)
     runs = np.array(path)  # (K + 1, M, n, 1 + width + n)
     errors = states.to_deviation(segments.x) - runs[..., 0]
-    constant = [i * p for i in range(n)]  # the first product is 1
     found = []
     for j in range(M):
         rows = [np.flatnonzero(segments.measured[:, j, i]) for i in range(n)]
@@ -232,9 +229,8 @@ def _linearised(drift: Drift, basis: LegendreBasis, segments: Segments, settings
         if all(np.isfinite(one).all() for one in (*residuals, *slopes)) and (
                 max(np.abs(one).max(initial=0.0) for one in residuals)
                 < settings.largest_residual):
-            found.append(_Piece(residuals, tuple(one[:, :width] for one in slopes), tuple(
-                np.hstack((one[:, width:], one[:, constant])) if offsets else one[:, width:]
-                for one in slopes)))
+            found.append(_Piece(residuals, *(tuple(one[:, part] for one in slopes) for part in (
+                slice(width), slice(width, None)))))
     return found, len(found) / M
 
 
@@ -255,9 +251,9 @@ def _noise(pieces: Sequence[_Piece], c: Array, settings: Thresholds) -> tuple[Ar
     left: list[list[Array]] = [[] for _ in range(n)]
     for piece in pieces:
         rest = [r - S @ c for r, S in zip(piece.residuals, piece.sensitivities, strict=True)]
-        d = np.linalg.lstsq(np.vstack(piece.nuisances), np.concatenate(rest), rcond=None)[0]
+        d = np.linalg.lstsq(np.vstack(piece.starts), np.concatenate(rest), rcond=None)[0]
         for i in range(n):
-            left[i].append(rest[i] - piece.nuisances[i] @ d)
+            left[i].append(rest[i] - piece.starts[i] @ d)
     low, high = settings.autocorrelation
     sigma, rho = np.full(n, settings.least_noise), np.zeros(n)
     for i, runs in enumerate(left):
@@ -288,7 +284,7 @@ def _normal_equations(pieces: Sequence[_Piece], sigma: Array, rho: Array, width:
 
     for piece in pieces:
         r, S = whitened(piece.residuals), whitened(piece.sensitivities)
-        Q = np.linalg.qr(whitened(piece.nuisances))[0]
+        Q = np.linalg.qr(whitened(piece.starts))[0]
         r, S = r - Q @ (Q.T @ r), S - Q @ (Q.T @ S)
         G += S.T @ S
         b += S.T @ r

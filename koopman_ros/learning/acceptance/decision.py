@@ -116,8 +116,7 @@ def evaluate_model(found: Identified, learned: Trained | ClassComparison,
     plant = None
     if not reasons:
         try:
-            posterior = correction_posterior(drift, _own_terms(drift), found.episodes, thresholds,
-                                             offsets=len(found.offsets) > 0)
+            posterior = correction_posterior(drift, _own_terms(drift), found.episodes, thresholds)
         except (ValueError, np.linalg.LinAlgError) as error:
             reasons = (f'the plants that the record allows cannot be found: {error}',)
         else:

@@ -242,6 +242,8 @@ class Segments:
     #: (K + 1, M, n_x) measured states, lines between measurements, 0 between samples
     x: Array
     measured: NDArray[np.bool_]  #: (K + 1, M, n_x) whether a state was measured
+    #: (M, n_x) constant disturbances of the rates, in state units per time unit; (M, 1) for none
+    disturbance: Array
 
     __repr__ = short_repr
 
@@ -260,7 +262,11 @@ class Segments:
             u[k:, j] = episode.u[-1]
             rows = np.searchsorted(grid, episode.time)
             x[rows, j], measured[rows, j] = episode.interpolated(), ~np.isnan(episode.x)
-        return cls(steps, u, x, measured)
+        width = max(1, *(len(episode.disturbance) for episode in episodes))
+        disturbance = np.zeros((M, width))
+        for own, episode in zip(disturbance, episodes, strict=True):
+            own[:len(episode.disturbance)] = episode.disturbance
+        return cls(steps, u, x, measured, disturbance)
 
     @property
     def sampled(self) -> NDArray[np.bool_]:
@@ -272,16 +278,13 @@ class Segments:
         def tiled(one: Any) -> Any:
             return np.tile(one, (1, count, *[1] * (one.ndim - 2)))
 
-        return Segments(*map(tiled, (self.steps, self.u, self.x, self.measured)))
+        return Segments(tiled(self.steps), tiled(self.u), tiled(self.x), tiled(self.measured),
+                        np.tile(self.disturbance, (count, 1)))
 
-    def path(self, rate: Rate, x0: Array, added: Array | float = 0.0) -> Array:
-        """
-        Return the states (K + 1, M, n_x) from starts (M, n_x), not finite after divergence.
-
-        :param added: (M, n_x) constant rates.
-        """
+    def path(self, rate: Rate, x0: Array) -> Array:
+        """Return the states (K + 1, M, n_x) from starts (M, n_x), not finite after divergence."""
         u, h, added = (one.reshape(self.steps.size, -1) for one in (
-            self.u, self.steps, np.broadcast_to(added, (len(self.u), *x0.shape))))
+            self.u, self.steps, np.broadcast_to(self.disturbance, (len(self.u), *x0.shape))))
 
         def step(rows: Any, x: Array) -> Array:
             return runge_kutta_step(lambda x: rate(x, u[rows]) + added[rows], x, h[rows])

@@ -52,9 +52,11 @@ def without_episode_inputs(found: Identified, n_u: int) -> Identified:
         assert isinstance(one, DriftModel | NetworkDrift)
         return replace(one, B=one.B[:, :n_u], box=box)
 
-    return found.mapped(
-        first, lambda one: replace(one, u=one.u[:, :n_u], linear=one.linear[:n_u]),
-        offsets=offsets, dead_time=found.dead_time[:n_u])
+    def under_offset(one: Episode) -> Episode:
+        return replace(one, u=one.u[:, :n_u], linear=one.linear[:n_u],
+                       disturbance=drift.input_matrix[:, n_u:] @ one.u[0, n_u:])
+
+    return found.mapped(first, under_offset, offsets=offsets, dead_time=found.dead_time[:n_u])
 
 
 def _levels(episodes: int) -> Array:

@@ -92,8 +92,8 @@ class Predictor(Generic[_Drift]):
         """
         taken = np.cumsum(data.sampled, axis=0).max(axis=1)
         rows = min(int(np.sum(taken <= SETTLING)), len(data.steps))
-        first = Segments(data.steps[:rows], data.u[:rows], data.x[:rows + 1],
-                         data.measured[:rows + 1])
+        first = replace(data, steps=data.steps[:rows], u=data.u[:rows], x=data.x[:rows + 1],
+                        measured=data.measured[:rows + 1])
         n_x, n_y = self.gain.shape
         home = np.zeros((first.x.shape[1], n_x))
         home[:, :n_y] = self.target(first)[0]

@@ -79,7 +79,7 @@ def lagged(episode: Episode, lag: Array, longest: float = 0.0) -> Episode | None
             value = command + share * (value - command)
             applied.append(value)
         u[:, j], linear[j] = applied, True
-    return Episode(episode.time, episode.x, knots, u, tuple(linear)).part(
+    return replace(episode, input_time=knots, u=u, linear=tuple(linear)).part(
         int(first), len(episode))
 
 

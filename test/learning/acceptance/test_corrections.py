@@ -118,6 +118,15 @@ def test_nothing_is_missing_of_the_right_structure():
     assert found.used == 1.0
 
 
+def test_known_disturbances_of_episodes_leave_the_constant_determined():
+    episodes = [replace(recorded(lambda u, own=own: GAIN * u + own, seed=seed),
+                        disturbance=np.array([own])) for seed, own in enumerate((0.3, -0.2))]
+    found = correction_posterior(LINEAR, OWN, episodes)
+    assert missing_structure(found) is None
+    constants = [one.correction(np.zeros(1), np.zeros(1))[0] for one in found.draw(40)]
+    assert np.all(np.abs(constants) < 0.01)
+
+
 def test_the_band_covers_the_error_of_an_estimate_and_falls_with_the_noise():
     """Of the gain, by two standard deviations."""
     errors = []

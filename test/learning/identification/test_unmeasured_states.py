@@ -20,6 +20,7 @@ from koopman_ros.learning.identification import (
     Stopped,
     unmeasured_states,
 )
+from koopman_ros.learning.identification.drift import longest_step, prediction_error, Segments
 from koopman_ros.learning.identification.network_drift import NetworkDrift
 from koopman_ros.learning.identification.polynomial_candidates import PolynomialSearch
 from support.known_plants import box, methods
@@ -170,6 +171,11 @@ def test_a_constant_disturbance_of_each_day_is_no_part_of_the_drift():
     assert np.sort_complex(np.linalg.eigvals(slope)) == pytest.approx(
         np.sort_complex(np.linalg.eigvals(A)), rel=0.03)
     assert any('offset of each episode' in step for step in found.steps)
+    # segments have that of their episode
+    for some in (found.fitted, found.held_out):
+        data = Segments.of(some, longest_step(some))
+        error = prediction_error(drift.rate, data, drift.box.states.scale)
+        assert error[0] == pytest.approx(found.noise[0], rel=0.3)
 
 
 def test_steady_states_of_an_unstable_plant_from_closed_loop():
