@@ -145,7 +145,7 @@ QUADRUPLE_TANK = FaultPlant(
     'quadruple_tank', setpoint=(0.15, 0.1), other=(0.14, 0.11), by_hand=(3.2, 2.8), band=0.002,
     settle=200.0, afterwards=300.0, recovery=270.0, never={'level_2': 0.042}, highest=0.25,
     wired={f'{name}.topic': 'levels' for name in _LEVELS}, tuned={
-        **_each(_LEVELS, max_rate=0.01, max_step=0.01),
+        **_each(_LEVELS, max_rate=0.01, max_step=0.005),
         **_each(('pump_1', 'pump_2'), rate_limit=1.0), 'bumpless_transfer_time': 10.0})
 # The reactor of two states where no coolant that is held holds it, its concentration estimated.
 SADDLE = FaultPlant(
