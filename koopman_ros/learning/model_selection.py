@@ -313,8 +313,8 @@ def _judge(prepared: PreparedSamples, loops: int, backend: Backend | None) -> Ju
                                           disturbances=prepared.plant.disturbance_names)
         rejected = law_check is not None and not law_check.accepted
         cause = reference.cause if isinstance(reference, CorrectedRate) else ''
-        return replace(one, law_check=law_check,
-                       rejection=f'does not control the plant: {law_check}{cause}' if rejected
-                       else '')
+        return replace(
+            one, law_check=law_check, limit='; '.join(filter(None, [one.limit, cause])),
+            rejection=f'does not control the plant: {law_check}' if rejected else '')
 
     return Judge(judged, ROUNDING)

@@ -12,6 +12,7 @@ import numpy as np
 from koopman_ros.core.datasets import Array, DriftSamples, PlantDescription
 from koopman_ros.learning.identification.drift import DriftModel, steady_point
 from koopman_ros.learning.lift.input_model import InputModel
+from koopman_ros.learning.lift.reference_drift import corrected, CorrectedRate
 from koopman_ros.learning.lift.residuals import deviations
 from koopman_ros.model import Box, Coordinates
 
@@ -116,11 +117,19 @@ def check_nominal_point(plant: PlantDescription, samples: DriftSamples, box: Box
     nearest = rest[np.argsort(np.max(np.abs(x), axis=1), kind='stable')[
         :max(_FEWEST_NEAR, len(x) // 30)]]
     spread = np.sqrt(np.mean(nearest ** 2, axis=0) / len(nearest))
-    moves = np.abs(drift) > np.max([
-        _ERRORS * error + _DIFFERENCES * np.abs(drift - other.coefficients[0]),
-        _ERRORS * spread, _MISFITS * np.abs(np.mean(nearest, axis=0))], axis=0)
+    slight = np.max([_ERRORS * error + _DIFFERENCES * np.abs(drift - other.coefficients[0]),
+                     _ERRORS * spread, _MISFITS * np.abs(np.mean(nearest, axis=0))], axis=0)
+    moves = np.abs(drift) > slight
     if not moves.any():
         return
+    odd = np.arange(len(samples)) % 2 == 1
+    rate = corrected(fitted.rate, box, samples.where(~odd), samples.where(odd))
+    if isinstance(rate, CorrectedRate) and rate.cause:
+        # of a drift that is not affine in the inputs the constant of an affine fit says nothing
+        there = rate(box.states.center, box.inputs.center) / box.states.scale
+        moves &= np.abs(there) > slight
+        if not moves.any():
+            return
     nearby = 'excite the plant around a steady state'
     with contextlib.suppress(ValueError):
         x_held, u_held = steady_point(fitted, box.states.center, box.inputs.center)

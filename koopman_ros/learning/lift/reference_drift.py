@@ -48,7 +48,7 @@ class CorrectedRate:
         if squares[nonlinear].sum() < squares[~nonlinear].sum():
             return ''
         names = ' or '.join(self.correction.box.inputs.names)
-        return (f'; the effect of {names} is nonlinear: use the quantity that acts as the input, '
+        return (f'the effect of {names} is nonlinear: use the quantity that acts as the input, '
                 'or a narrower range')
 
 
