@@ -123,10 +123,10 @@ def check_nominal_point(plant: PlantDescription, samples: DriftSamples, box: Box
     if not moves.any():
         return
     odd = np.arange(len(samples)) % 2 == 1
-    rate = corrected(fitted.rate, box, samples.where(~odd), samples.where(odd))
-    if isinstance(rate, CorrectedRate) and rate.cause:
+    whole = corrected(fitted.rate, box, samples.where(~odd), samples.where(odd))
+    if isinstance(whole, CorrectedRate) and whole.cause:
         # of a drift that is not affine in the inputs the constant of an affine fit says nothing
-        there = rate(box.states.center, box.inputs.center) / box.states.scale
+        there = whole(box.states.center, box.inputs.center) / box.states.scale
         moves &= np.abs(there) > slight
         if not moves.any():
             return
