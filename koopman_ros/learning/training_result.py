@@ -87,14 +87,25 @@ class TrainingResult:
 
     @property
     def found_text(self) -> str:
-        """Structure, unmeasured states, dead times and lags, in a line."""
+        """Structure, unmeasured states, dead times, lags and offsets of episodes, in a line."""
         hidden, names = self.found.hidden, self.found.drift.box.inputs.names
         late = [f'{what} {seconds:.4g} s of {name}' for what, values in (
             ('dead time', self.dead_time), ('lag', self.lag))
             for name, seconds in zip(names, values.tolist(), strict=True) if seconds > 0.0]
         return ', '.join([
             self.found.drift.form, f'{hidden or "no"} unmeasured state{"s" * (hidden > 1)}',
-            *(late or ['no dead time'])])
+            *(late or ['no dead time']),
+            *([f'a constant disturbance of each episode ({self._shift_text})'] if len(
+                self.found.offsets) else [])])
+
+    @property
+    def _shift_text(self) -> str:
+        """By how much the disturbances of the episodes move the measured states."""
+        states, shifts = self.found.drift.box.states, self.found.shifts
+        return '; '.join(
+            f'{name} by {", ".join(f"{value:+.3g}" for value in column.tolist())} {unit}'
+            for name, unit, column in zip(states.names, states.units, shifts.T, strict=False)
+            if np.isfinite(column).all()) or 'the states drift away by it'
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """

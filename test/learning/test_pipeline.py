@@ -139,6 +139,16 @@ def test_rejected_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_pa
     assert again.read_bytes() == present.read_bytes()
 
 
+def test_the_disturbance_of_each_episode_is_said_as_a_shift(accepted):
+    retrained, *_ = accepted
+    found = retrained.found
+    states = found.drift.box.states
+    offsets = np.outer([0.1, -0.1], found.drift.slope(states.center)[:, 0])
+    assert 'of each episode' not in retrained.found_text
+    shifted = replace(retrained, found=replace(found, offsets=offsets))
+    assert f'{states.names[0]} by -0.1, +0.1 {states.units[0]}' in shifted.found_text
+
+
 def test_report_without_matplotlib(accepted, monkeypatch):
     retrained, _, _ = accepted
     monkeypatch.setitem(sys.modules, 'matplotlib.figure', None)

@@ -17,6 +17,7 @@ import numpy as np
 from koopman_ros.core.arrays import expect, short_repr
 from koopman_ros.core.datasets import Array, cut, Episode, PlantDescription
 from koopman_ros.core.plugins import contained
+from koopman_ros.core.solvers import decaying
 from koopman_ros.execution import Backend, Notify, Serial
 from koopman_ros.identification_methods import METHODS
 from koopman_ros.learning.identification.base import (
@@ -164,6 +165,19 @@ class Identified:
     def episodes(self) -> list[Episode]:
         """All segments."""
         return [*self.fitted, *self.held_out]
+
+    @property
+    def shifts(self) -> Array:
+        """
+        Shifts (E, n_y) of the measured steady states by the offsets, in state units.
+
+        In the middle of the range; infinite where an offset makes the plant drift away.
+        """
+        slope = self.drift.slope(self.drift.box.states.center)
+        count = len(slope) - self.hidden
+        if not decaying(np.linalg.eigvals(slope)).all():
+            return np.full((len(self.offsets), count), np.inf)
+        return np.asarray(-np.linalg.solve(slope, self.offsets.T).T[:, :count])
 
     def mapped(self, drift: Callable[[Any], Any], episode: Callable[[Episode], Episode],
                **changes: Any) -> Identified:
