@@ -283,8 +283,8 @@ def silent_pendulum(loop: FaultHarness) -> None:
     altered(loop, lost, 10.0)
     _expect_error(loop)
     before = len(loop.trace.commands)
-    loop.run_for(2.0)
-    loop.expect(len(loop.trace.commands) > before + 50, 'measurements are not answered any more')
+    loop.wait(lambda: len(loop.trace.commands) > before + 50,
+              'measurements are not answered any more')
 
 
 def one_ahead(loop: FaultHarness) -> None:
