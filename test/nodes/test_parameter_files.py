@@ -30,10 +30,13 @@ def test_a_section_that_is_not_read_is_a_warning(ros: Harness, tmp_path: Path) -
     (tmp_path / 'own.yaml').write_text(
         '/**:\n  ros__parameters: {system: two_tanks}\n' + OPERATORS.format('controller'))
     process = ros.start('controller', arguments=(
-        '--params-file', str(tmp_path / 'own.yaml'), '-r', '__ns:=/east'))
-    assert ros.get_parameters('/east/controller', 'pump_1.max') == [12.0]
-    ros.wait_until(lambda: '"/**/controller:"' in process.output())
-    assert 'WARN' in next(line for line in process.output().splitlines() if 'own.yaml' in line)
+        '--params-file', str(tmp_path / 'own.yaml'), '-r', '__ns:=/east',
+        '-p', 'controller:pump_2.max:=4.0'))
+    assert ros.get_parameters('/east/controller', 'pump_1.max', 'pump_2.max') == [12.0, 12.0]
+    for source in ('own.yaml', '-p controller:pump_2.max:=4.0'):
+        ros.wait_until(lambda source=source: any(
+            'WARN' in line and source in line and '"/**/controller:"' in line
+            for line in process.output().splitlines()), source)
 
 
 @pytest.mark.parametrize(('section', 'name', 'ignored'), [
@@ -49,8 +52,14 @@ def test_a_section_that_is_not_read_is_a_warning(ros: Harness, tmp_path: Path) -
 def test_sections_that_ros_does_not_read(
         tmp_path: Path, section: str, name: str, ignored: bool) -> None:
     (tmp_path / 'own.yaml').write_text(OPERATORS.format(section))
-    found = ignored_sections(
-        ['node', '--ros-args', '--params-file', str(tmp_path / 'own.yaml')], 'controller', name)
-    assert bool(found) == ignored
-    if found:
-        assert f'"/**/{name.rpartition("/")[2]}:"' in found[0]
+    for given in (['--params-file', str(tmp_path / 'own.yaml')],
+                  ['-p', f'{section}:pump_1.max:=3.0'], ['--param', f'{section}:pump_1.max:=3.0']):
+        found = ignored_sections(['node', '--ros-args', *given], 'controller', name)
+        assert bool(found) == ignored
+        if found:
+            assert f'"/**/{name.rpartition("/")[2]}:"' in found[0]
+
+
+def test_a_parameter_without_a_section_is_not_ignored() -> None:
+    assert ignored_sections(['node', '--ros-args', '-p', 'controller:=1', '-p', 'model:=a:b'],
+                            'controller', '/east/controller') == []
