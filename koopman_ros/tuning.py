@@ -19,6 +19,7 @@ from koopman_ros.core.declaration import (
     nested,
     parameter,
     plugin_parameters,
+    Settings,
     UNBOUNDED,
     value_column,
 )
@@ -26,9 +27,23 @@ from koopman_ros.core.plugins import short_name
 from koopman_ros.model import LiftedModel, LONGEST_DEAD_TIME
 
 
+class _Limits(Settings):
+    """Settings with a lower and an upper limit."""
+
+    lower: Array
+    upper: Array
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        lower, upper = np.asarray(self.lower), np.asarray(self.upper)
+        alike = lower.shape == upper.shape or 0 in (lower.ndim, upper.ndim)
+        if alike and np.any(lower > upper):
+            raise ValueError(f'lower = {lower.tolist()} must be below upper = {upper.tolist()}')
+
+
 @dataclass(frozen=True)
-class InputLimits:
-    """Range and rate limits of the inputs, in input units."""
+class InputLimits(_Limits):
+    """Range and rate limits of the inputs."""
 
     lower: Array = value_column('inputs', 0.0, 'Smallest command.', name='min')
     upper: Array = value_column('inputs', 0.0, 'Largest command.', name='max')
@@ -42,7 +57,7 @@ class InputLimits:
 
 
 @dataclass(frozen=True)
-class SensorLimits:
+class SensorLimits(_Limits):
     """Limits of the sensors and of the rates of their signals, one number per measured signal."""
 
     lower: Array = value_column(
@@ -79,7 +94,7 @@ class SensorLimits:
 
 
 @dataclass(frozen=True)
-class DisturbanceLimits:
+class DisturbanceLimits(_Limits):
     """Sensor limits of the measured disturbances; if one is violated, the last value is held."""
 
     lower: Array = value_column(
@@ -95,12 +110,11 @@ class DisturbanceLimits:
 
 
 @dataclass(frozen=True)
-class Tuning:
+class Tuning(Settings):
     """
     The tuning of a controller, in the units of the model's signals.
 
-    Field and parameter have one name, except for columns with a row of another name: a row
-    ``weight`` of a state is the parameter ``<state>.weight``.
+    A field of each of some signals takes one number for all of them, or an array.
     """
 
     state_weight: Array = column(

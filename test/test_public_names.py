@@ -143,8 +143,10 @@ WRONG = {
     'swapped arguments': (lambda m: Controller(Tuning.for_model(m), m), TypeError, 'model must'),
     'too few limits': (lambda m: controller(m, limits=InputLimits(
         lower=[0.0] * 3, upper=[12.0] * 3)), ValueError, 'pump_1, pump_2'),
-    'crossed limits': (lambda m: controller(m, limits=InputLimits(lower=12.0, upper=0.0)),
-                       ValueError, 'pump_1'),
+    'crossed limits': (lambda m: InputLimits(lower=12.0, upper=0.0), ValueError,
+                       'lower = 12.0 must be below upper = 0.0'),
+    'equal limits': (lambda m: controller(m, limits=InputLimits(lower=[0.0, 3.0], upper=3.0)),
+                     ValueError, 'pump_2'),
     'negative weight': (lambda m: controller(m, state_weight=-1.0), ValueError, 'state_weight'),
     'text': (lambda m: controller(m, state_weight='large'), ValueError, 'state_weight'),
     'NaN': (lambda m: controller(m, state_weight=[np.nan, 1.0]), ValueError, 'state_weight'),

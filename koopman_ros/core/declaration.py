@@ -5,28 +5,31 @@
 Declaration of parameters as fields of a frozen dataclass.
 
 One field gives name, type, default, unit, range and description: nodes declare it, check it and
-write it into YAML (:mod:`koopman_ros.parameters.table`), Python code sets it as a keyword.
+write it into YAML (:mod:`koopman_ros.parameters.table`), Python code sets it as a keyword, and
+the docstring of its class shows it.
 
 A custom control law declares its own parameters in the same way::
 
     @dataclass(frozen=True)
-    class Gains:
+    class Gains(Settings):
         gain: Array = column('controlled', 1.0, 'Proportional gain.')
         limit: float = parameter(10.0, 'Largest change per sample.', 's', 0.0, 100.0)
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, Field, field, fields, is_dataclass, replace
+import inspect
 import math
+import textwrap
 from typing import Any, TypeVar
 
 import numpy as np
 
 from koopman_ros.core.arrays import Array
 
-__all__ = ['UNBOUNDED', 'Column', 'NoParameters', 'column', 'for_signals', 'group', 'nested',
-           'of_other_states', 'parameter', 'per_signal', 'plugin_parameters', 'signal_value',
-           'value_column']
+__all__ = ['UNBOUNDED', 'Column', 'NoParameters', 'Settings', 'column', 'for_signals', 'group',
+           'nested', 'of_other_states', 'parameter', 'per_signal', 'plugin_parameters',
+           'signal_value', 'value_column']
 
 T = TypeVar('T')
 
@@ -34,6 +37,34 @@ T = TypeVar('T')
 UNBOUNDED = 1e9
 # Numbers in YAML that stand for no bound, and the infinity that is meant.
 ANY, NO_LOWER, NO_UPPER = (0.0, math.inf), (-UNBOUNDED, -math.inf), (UNBOUNDED, math.inf)
+
+
+class Settings:
+    """
+    Base class of a frozen dataclass of declared fields, which are checked where they are written.
+
+    Its docstring gets a list of them. In Python and YAML one number stands for no bound.
+
+    :raises ValueError: for a number that is none or out of its range, naming field and value.
+    """
+
+    def __init_subclass__(cls) -> None:
+        rows = [row for name, item in vars(cls).items() if isinstance(item, Field)
+                for row in _described(name, item)]
+        cls.__doc__ = '\n\n'.join([inspect.cleandoc(cls.__doc__ or ''), '\n'.join(rows)])
+
+    def __post_init__(self) -> None:
+        for item in fields(self):  # type: ignore[arg-type]
+            value, of = getattr(self, item.name), item.metadata.get('column')
+            if of is None:
+                if isinstance(item.default, float):
+                    _check_range(item.name, _numbers(item.name, value), item.metadata)
+                continue
+            numbers = _numbers(item.name, value)
+            if of.none is not None and np.any(numbers == of.none[0]):
+                numbers = np.where(numbers == of.none[0], of.none[1], numbers)
+                object.__setattr__(self, item.name, numbers)
+            _check_range(item.name, numbers, item.metadata)
 
 
 @dataclass(frozen=True)
@@ -68,6 +99,10 @@ def parameter(default: Any, description: str, unit: str = '', minimum: float = -
 def signal_value(default: float, description: str, **details: Any) -> Any:
     """Declare a value of a signal, in the unit in which people read it, that may be any."""
     return parameter(default, description, '{shown}', -UNBOUNDED, UNBOUNDED, **details)
+
+
+_ONE_OF = {'states': 'state', 'measured': 'measured signal', 'controlled': 'controlled signal',
+           'inputs': 'input', 'disturbances': 'disturbance'}
 
 
 def column(signals: str, default: float, description: str, unit: str = '{unit}',
@@ -162,12 +197,45 @@ def of_other_states(parameters: T, before: Sequence[str], now: Sequence[str]) ->
     return replace(parameters, **changes)  # type: ignore[type-var]
 
 
-def _one_each(name: str, value: Any, signals: Sequence[str], metadata: Mapping[str, Any]
-              ) -> Array:
+def _described(name: str, item: Field[Any]) -> list[str]:
+    """Return the lines of a docstring about a field."""
+    about, of = item.metadata, item.metadata.get('column')
+    if 'description' not in about:
+        kind = about.get('nested')
+        return [f'``{name}``: ' + ('own parameters of laws and estimators, by name' if kind is None
+                                  else f'see ``{kind.__name__}``')]
+    unit = about['unit'].replace('{shown}', 'its unit').replace('({unit})', '(its unit)').replace(
+        '{unit}', 'its unit')
+    default = item.default if of is None else of.default
+    bounds = _range_words(about['minimum'], about['maximum'], about.get('open_minimum', False))
+    signal = '' if of is None else _ONE_OF[of.signals]
+    facts = [signal and f'one per {signal}', unit and f'in {unit}', bounds, 'default ' + (
+        'no limit' if default in (UNBOUNDED, -UNBOUNDED) else
+        f'{default:.10g}' if isinstance(default, float) else repr(default)),
+        f'in YAML ``<{signal}>.{of.name}``' if of is not None and of.name else '']
+    return [f'``{name}``: {", ".join(filter(None, facts))}',
+            *textwrap.wrap(about['description'], 92, initial_indent='    ',
+                           subsequent_indent='    ')]
+
+
+def _range_words(minimum: float, maximum: float, opened: bool) -> str:
+    low, high = (abs(one) < UNBOUNDED for one in (minimum, maximum))
+    above = f'{"above" if opened else "at least"} {minimum:.10g}' * low
+    below = f'at most {maximum:.10g}' * high
+    return f'{minimum:.10g} to {maximum:.10g}' if low and high and not opened else (
+        ' and '.join(filter(None, (above, below))))
+
+
+def _numbers(name: str, value: Any) -> Array:
     try:
-        array = np.asarray(value, dtype=np.float64)
+        return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f'{name} must be numbers, got {value!r}') from error
+
+
+def _one_each(name: str, value: Any, signals: Sequence[str], metadata: Mapping[str, Any]
+              ) -> Array:
+    array = _numbers(name, value)
     if array.ndim == 0:
         array = np.full(len(signals), array)
     if array.shape != (len(signals),):
@@ -181,13 +249,12 @@ def _one_each(name: str, value: Any, signals: Sequence[str], metadata: Mapping[s
 
 def _check_range(name: str, value: Array, metadata: Mapping[str, Any]) -> None:
     low, high, of = metadata['minimum'], metadata['maximum'], metadata.get('column')
-    # in code 0 stands for itself, not for no bound
-    opened = metadata.get('open_minimum', False) or (of is not None and of.none == ANY)
+    opened = metadata.get('open_minimum', False)
     # of a value of a signal the range is in the unit that people read
     fits = ~np.isnan(value) if metadata['unit'] == '{shown}' else (
         (value > low if opened else value >= low) & (value <= high))
     if of is not None and of.none is not None:
         fits |= value == of.none[1]
     if not np.all(fits):
-        raise ValueError(f'{name} must be {"above" if opened else "at least"} {low:g} and at most '
-                         f'{high:g}, got {value.tolist()}')
+        raise ValueError(f'{name} = {value.tolist()} must be '
+                         f'{_range_words(low, high, opened) or "a number"}')

@@ -136,8 +136,11 @@ def _controller(values: Mapping[str, Any], model: LiftedModel) -> Controller:
             if '.' not in name or name.partition('.')[0] in signals.units)):
         raise RecordError(f'its controller had the parameters {unknown}, which this version does '
                           'not have: use the package that recorded it')
-    snapshot = table.snapshot(values)
-    if reason := table.check(snapshot):
-        raise RecordError(f'its controller had parameters that this version rejects ({reason}): '
-                          'use the package that recorded it')
+    try:
+        snapshot = table.snapshot(values)
+        if reason := table.check(snapshot):
+            raise ConfigurationError(reason)
+    except ConfigurationError as error:
+        raise RecordError(f'its controller had parameters that this version rejects ({error}): '
+                          'use the package that recorded it') from None
     return built(snapshot, model)

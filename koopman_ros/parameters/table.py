@@ -199,9 +199,20 @@ class ParameterTable(Generic[T]):
         return self.signals.get(name, {})
 
     def snapshot(self, values: Mapping[str, Any]) -> T:
-        """Return the snapshot of values by name; those that are not given are the defaults."""
-        made: T = self._make({
-            name: values.get(name, row.default) for name, row in self.rows.items()})
+        """
+        Return the snapshot of values by name; those that are not given are the defaults.
+
+        :raises ConfigurationError: for a value out of its range, or limits in the wrong order.
+        """
+        every = {name: values.get(name, row.default) for name, row in self.rows.items()}
+        for name, row in self.rows.items():
+            if reason := row.check(every[name]):
+                raise ConfigurationError(reason)
+        for low, high in self._ordered_rows():
+            if not every[low] < every[high]:
+                raise ConfigurationError(f'{self._given(low, every)} must be below '
+                                         f'{self._given(high, every)}: change the other one first')
+        made: T = self._make(every)
         return made
 
     def values(self, snapshot: T) -> dict[str, Any]:
@@ -215,18 +226,10 @@ class ParameterTable(Generic[T]):
 
     def check(self, snapshot: T, before: T | None = None) -> str:
         """
-        Return the first thing wrong with a snapshot, or an empty string.
+        Return the first thing wrong with a snapshot as a whole, or an empty string.
 
         :param before: the one in force, which is known to be right; None for the defaults.
         """
-        values = self.values(snapshot)
-        for name, row in self.rows.items():
-            if reason := row.check(values[name]):
-                return reason
-        for low, high in self._ordered_rows():
-            if not values[low] < values[high]:
-                return (f'{self._given(low, values)} must be below '
-                        f'{self._given(high, values)}: change the other one first')
         return self.cross_check(snapshot) or self._unusable(
             snapshot, self.snapshot({}) if before is None else before)
 
@@ -237,12 +240,12 @@ class ParameterTable(Generic[T]):
 
     def _unusable(self, snapshot: T, before: T) -> str:
         """Return why nothing can be built from values that fit each for itself, or ''."""
-        if not (error := self._build_error(snapshot)):
-            return ''
         values, old = self.values(snapshot), self.values(before)
+        if not (error := self._build_error(values)):
+            return ''
         changed = [row for name, row in self.rows.items() if values[name] != old[name]]
         guilty = [row for row in changed if not self._build_error(
-            self.amended(snapshot, **{row.name: old[row.name]}))] or changed
+            {**values, row.name: old[row.name]})] or changed
         given = ' and '.join(self._given(row.name, values) for row in guilty)
         ranges = dict.fromkeys(f' in {row.range_text}' for row in guilty if row.range_text)
         return f'{given} is not usable: {error}; choose another value{" or".join(ranges)}'
@@ -250,9 +253,9 @@ class ParameterTable(Generic[T]):
     def _given(self, name: str, values: Mapping[str, Any]) -> str:
         return f'{name} = {values[name]} {self.rows[name].unit}'.rstrip()
 
-    def _build_error(self, snapshot: T) -> str:
+    def _build_error(self, values: Mapping[str, Any]) -> str:
         try:
-            self.build(snapshot)
+            self.build(self._make(values))
         except (ValueError, ArithmeticError) as error:
             return ' '.join(str(error).split()) or type(error).__name__
         except Exception as error:  # of a user's class, anywhere in the object that is built

@@ -15,7 +15,7 @@ import numpy as np
 
 from koopman_ros.core.arrays import short_repr, show_printed
 from koopman_ros.core.datasets import Episode, PlantDescription
-from koopman_ros.core.message_fields import base_name, place
+from koopman_ros.core.message_fields import base_name, place, SIGNAL_NAME
 from koopman_ros.core.units import check_unit, NANOSECONDS
 from koopman_ros.records.episodes import loop_episodes
 from koopman_ros.records.import_spec import ImportReport, RecordedInput, RecordedState
@@ -164,6 +164,10 @@ def _check_names(states: Sequence[SignalColumn], inputs: Sequence[SignalColumn],
     every = [one.name for one in (*states, *inputs)]
     if not (states and inputs):
         raise ValueError('a record has states and inputs: name at least one of each')
+    if wrong := [name for name in every if not SIGNAL_NAME.fullmatch(name)]:
+        raise ValueError(f'{wrong[0]!r} cannot be the name of a signal, which has letters, digits '
+                         'and _ and begins with a letter: name it, as in '
+                         f"'level = {wrong[0]}'")
     if repeated := [name for name in every if every.count(name) > 1]:
         raise ValueError(f'{repeated[0]} is named twice: give each signal once')
     if unknown := [name for name in linear if name not in every[len(states):]]:

@@ -184,8 +184,11 @@ class LoopNode(HostedNode):
                 return code
             # rclpy has rejected values of another type
             values = changed(changes)
-            merged = table.amended(current, **values)
-            reason = table.check(merged, current) or accept(merged, set(values))
+            try:
+                merged = table.amended(current, **values)
+                reason = table.check(merged, current) or accept(merged, set(values))
+            except ConfigurationError as error:
+                reason = str(error)
             if reason:
                 self.get_logger().warning(f'parameter change rejected: {reason}')
             return msg.SetParametersResult(successful=not reason, reason=reason)

@@ -422,20 +422,19 @@ def test_the_mode_changes_between_operator_and_law():
 
 @pytest.mark.parametrize(('part', 'name', 'value'), [
     ('', 'state_weight', 0.0), ('', 'state_weight', -1.0), ('', 'input_weight', 0.0),
-    ('', 'input_weight', np.nan), ('', 'setpoint_ramp', 0.0), ('', 'safe_value', np.inf),
+    ('', 'input_weight', np.nan), ('', 'setpoint_ramp', -1.0), ('', 'safe_value', np.inf),
     ('', 'tracking_tolerance', -1.0), ('', 'bumpless_transfer_time', np.inf),
-    ('sensor', 'rate', 0.0),
-    ('sensor', 'jump', np.nan), ('sensor', 'stuck_sensor_timeout', -1.0), ('limits', 'rate', 0.0),
+    ('sensor', 'rate', -1.0),
+    ('sensor', 'jump', np.nan), ('sensor', 'stuck_sensor_timeout', -1.0), ('limits', 'rate', -1.0),
     ('', 'state_weight', 'heavy'), ('', 'learned_model_margin', -0.1), ('', 'hold_timeout', -1.0),
     ('', 'recovery_time', math.nan), ('', 'fallback_order', ()),
     ('', 'fallback_order', ('sdre', 'sdre'))])
 def test_a_tuning_that_makes_no_sense_is_rejected(part, name, value):
     loop = controller()
     tuning = loop.tuning
-    changed = replace(tuning, **{name: value}) if not part else replace(
-        tuning, **{part: replace(getattr(tuning, part), **{name: value})})
-    with pytest.raises(ValueError, match=f'{name} must'):
-        replace(loop, tuning=changed)
+    with pytest.raises(ValueError, match=name):
+        replace(loop, tuning=replace(tuning, **{name: value}) if not part else replace(
+            tuning, **{part: replace(getattr(tuning, part), **{name: value})}))
 
 
 def test_margins_in_the_wrong_order_are_rejected():
@@ -447,9 +446,10 @@ def test_margins_in_the_wrong_order_are_rejected():
 @pytest.mark.parametrize('part', ['limits', 'sensor'])
 def test_limits_in_the_wrong_order_are_rejected(part):
     loop = controller()
-    wrong = replace(getattr(loop.tuning, part), lower=400.0, upper=300.0)
-    with pytest.raises(ValueError, match=r'must be lower < upper, got \[400'):
-        replace(loop, tuning=replace(loop.tuning, **{part: wrong}))
+    for upper in (300.0, 400.0):
+        with pytest.raises(ValueError, match='400'):
+            replace(loop, tuning=replace(loop.tuning, **{part: replace(
+                getattr(loop.tuning, part), lower=400.0, upper=upper)}))
 
 
 # The set-point by itself.

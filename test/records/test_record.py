@@ -161,8 +161,9 @@ def test_a_signal_may_have_another_column_name_and_unit():
     assert record.plant.input_units == ('1',)
     assert "write 'heater [m]'" in str(record)
     for names, words in ((('flow', 'HC12'), "no column 'flow', it has 'time', 'TI-101.PV"),
-                         (('TI-101.PV [m]', 'HC12'), 'cannot be converted'),
-                         (('TI-101.PV', 'HC12 [squeeze]'), 'no unit')):
+                         (('TI-101.PV', 'HC12'), "name it, as in 'level = TI-101.PV'"),
+                         (('level = TI-101.PV [m]', 'HC12'), 'cannot be converted'),
+                         (('level = TI-101.PV', 'HC12 [squeeze]'), 'no unit')):
         with pytest.raises(ValueError, match=words):
             read(table, *names)
 

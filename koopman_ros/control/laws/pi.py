@@ -12,7 +12,7 @@ import numpy as np
 
 from koopman_ros.control.laws.base import Law, LawResult, SolutionInfo, Target
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.declaration import column, UNBOUNDED
+from koopman_ros.core.declaration import column, Settings, UNBOUNDED
 from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.estimation import Estimate
 from koopman_ros.model import LiftedModel
@@ -20,7 +20,7 @@ from koopman_ros.tuning import Tuning
 
 
 @dataclass(frozen=True)
-class PIParameters:
+class PIParameters(Settings):
     """Gains and integral times; the first state with a gain moves the first input, and so on."""
 
     gain: Array = column(

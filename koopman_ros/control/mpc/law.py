@@ -16,7 +16,14 @@ from koopman_ros.control.laws.base import LaterInputs, Law, LawResult, SolutionI
 from koopman_ros.control.laws.riccati import StateDependentRiccati
 from koopman_ros.control.mpc.grid import PlanningSettings
 from koopman_ros.core.arrays import Array
-from koopman_ros.core.declaration import NO_LOWER, NO_UPPER, parameter, UNBOUNDED, value_column
+from koopman_ros.core.declaration import (
+    NO_LOWER,
+    NO_UPPER,
+    parameter,
+    Settings,
+    UNBOUNDED,
+    value_column,
+)
 from koopman_ros.core.status import Reason, reason, StatusCode
 from koopman_ros.estimation import Estimate
 from koopman_ros.model import LiftedModel
@@ -29,7 +36,7 @@ _PACKAGE = 'daqp'
 
 
 @dataclass(frozen=True)
-class MPCParameters:
+class MPCParameters(Settings):
     """Soft limits of the states, and the time limit of a plan."""
 
     lower: Array = value_column(
