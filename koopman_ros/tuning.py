@@ -11,7 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from koopman_ros.core.arrays import Array, short_repr
+from koopman_ros.core.arrays import Array, expect, real, short_repr
 from koopman_ros.core.declaration import (
     ANY,
     column,
@@ -272,8 +272,9 @@ class Tuning(Settings):
         the inputs' limits their trained range, and the safe inputs the nominal ones; of times see
         :func:`time_defaults`. These are the defaults of the controller node, too.
         """
+        expect(model=(model, LiftedModel))
         inputs, weights = model.inputs, np.zeros(model.n_x)
-        dead_time = np.asarray(given.get('dead_time', -1.0))
+        dead_time = real(given.get('dead_time', -1.0), 'dead_time')
         longest = np.max(np.where(dead_time < 0.0, model.dead_time, dead_time), initial=0.0)
         weights[model.measured] = 1.0 / model.states.scale[model.measured] ** 2
         return cls(**{

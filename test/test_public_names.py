@@ -5,8 +5,10 @@
 
 import importlib
 import inspect
+from pathlib import Path
 import subprocess
 import sys
+import traceback
 
 import numpy as np
 import pandas as pd
@@ -162,6 +164,81 @@ WRONG = {
         [at(0.0, SetpointRequest(0, [9.0, 0.15]))], duration=5.0), ValueError, 'level_1'),
     'no file': (lambda m: load('none.safetensors'), (OSError, ValueError), 'none.safetensors'),
     'other signals': (lambda m: simulate(m, RECORD), ValueError, 'level_1'),
+    # tables
+    'transposed table': (lambda m: read(table().T, ['level'], ['pump']), ValueError, 'level'),
+    'one column': (lambda m: read(table()['level [m]'], ['level'], ['pump']),
+                   (TypeError, ValueError), ''),
+    'array': (lambda m: read(table().to_numpy(), ['level'], ['pump']), (TypeError, ValueError),
+              ''),
+    'numbers of columns': (lambda m: read(table(), [0], [1]), TypeError, 'states'),
+    'swapped table': (lambda m: read(['level'], table(), ['pump']), TypeError, 'states'),
+    'empty table': (lambda m: read(table()[:0], ['level'], ['pump']), ValueError, ''),
+    'one row': (lambda m: read(table()[:1], ['level'], ['pump']), ValueError, ''),
+    'shuffled rows': (lambda m: read(table().sample(frac=1.0, random_state=1), ['level'],
+                                     ['pump']), ValueError, ''),
+    'missing values': (lambda m: read(table().assign(**{'level [m]': np.nan}), ['level'],
+                                      ['pump']), ValueError, 'level'),
+    'words for numbers': (lambda m: read(table().assign(**{'level [m]': 'high'}), ['level'],
+                                         ['pump']), ValueError, 'high'),
+    'columns of two lengths': (lambda m: read({'time': [0, 1, 2], 'level': [1, 2],
+                                               'pump': [1, 2, 3]}, 'level', 'pump'),
+                               ValueError, 'level'),
+    'no table': (lambda m: read('none.csv', ['level'], ['pump']), OSError, 'none.csv'),
+    'unknown time': (lambda m: read(table(), ['level'], ['pump'], time='clock'), ValueError,
+                     'clock'),
+    'period below 0': (lambda m: read(table(), ['level'], ['pump'], period=-1.0), ValueError,
+                       'period'),
+    'name of a tag': (lambda m: read(table(), ['LI-101'], ['pump']), ValueError,
+                      "'level = LI-101'"),
+    # training
+    'count as text': (lambda m: learn(RECORD, unmeasured_states='one'), TypeError,
+                      'unmeasured_states'),
+    'half a state': (lambda m: learn(RECORD, unmeasured_states=1.5), TypeError, '1.5'),
+    'states below -1': (lambda m: learn(RECORD, unmeasured_states=-2), ValueError, '-2'),
+    'time for all inputs': (lambda m: learn(RECORD, dead_time=3.0), TypeError, "{'pump': 3.0}"),
+    'lag for all inputs': (lambda m: learn(RECORD, lag=3.0), TypeError, 'lag'),
+    'seed as text': (lambda m: learn(RECORD, seed='a'), TypeError, 'seed'),
+    'no function': (lambda m: learn(RECORD, on_progress=3), TypeError, 'on_progress'),
+    # settings
+    'pair for limits': (lambda m: controller(m, limits=(0.0, 12.0)), TypeError, 'InputLimits'),
+    'names of YAML': (lambda m: InputLimits(min=0.0), TypeError, 'min'),
+    'limits by name': (lambda m: InputLimits(lower={'pump_1': 0.0}), ValueError, 'lower'),
+    'matrix of weights': (lambda m: controller(m, state_weight=np.eye(2)), ValueError,
+                          'state_weight'),
+    'time by name': (lambda m: controller(m, dead_time={'pump_1': 1.0}), ValueError, 'dead_time'),
+    'unknown law': (lambda m: controller(m, fallback_order=('sdr',)), ValueError, 'sdr'),
+    'law as text': (lambda m: controller(m, fallback_order='sdre'), TypeError, 'fallback_order'),
+    'unknown estimator': (lambda m: controller(m, estimator='kalman'), ValueError, 'kalman'),
+    'unknown signal': (lambda m: controller(m, controlled=('level_3',)), ValueError, 'level_3'),
+    'time as text': (lambda m: controller(m, hold_timeout='60'), TypeError, 'hold_timeout'),
+    'switch as text': (lambda m: controller(m, safe_latch='yes'), TypeError, 'safe_latch'),
+    'tuning of no model': (lambda m: Tuning.for_model('two_tanks'), TypeError, 'LiftedModel'),
+    # steps
+    'no state': (lambda m: controller(m).step(None, X, 1), TypeError, 'state'),
+    'swapped state': (lambda m: controller(m).step(X, State(), 1), TypeError, 'state'),
+    'measurement by name': (lambda m: controller(m).step(State(), {'level_1': 0.1}, 1),
+                            ValueError, 'measurement'),
+    'measured text': (lambda m: controller(m).step(State(), ['a', 'b'], 1), ValueError, "'a'"),
+    'complex numbers': (lambda m: controller(m).step(State(), [1j, 0.1], 1), ValueError, 'real'),
+    'swapped request': (lambda m: controller(m).request_setpoint(X, State()), TypeError, 'state'),
+    'one set-point': (lambda m: controller(m).request_setpoint(State(), 0.1), ValueError,
+                      'level_1'),
+    # loops
+    'plant by name': (lambda m: Process('two_tanks', 0, X, X), TypeError, 'ControlAffineSystem'),
+    'one state': (lambda m: Process(build('two_tanks'), 0, [0.1], X), ValueError, 'level_1'),
+    'start in s': (lambda m: Process(build('two_tanks'), 0.5, X, X), TypeError, 'nanoseconds'),
+    'swapped loop': (lambda m: run_loop(Process(build('two_tanks'), 0, X, X), controller(m),
+                                        duration=1.0), TypeError, 'controller'),
+    'system as plant': (lambda m: run_loop(controller(m), build('two_tanks'), duration=1.0),
+                        TypeError, 'plant'),
+    'another plant': (lambda m: run_loop(controller(m), Process(
+        build('pendulum'), 0, [0.0, 0.0], [0.0]), duration=1.0), ValueError, '1 inputs'),
+    'event without time': (lambda m: run_loop(controller(m), Process(
+        build('two_tanks'), 0, X, X), [SetpointRequest(0, X)], duration=1.0), TypeError, 'at'),
+    'swapped event': (lambda m: at(SetpointRequest(0, X), 20.0), TypeError, 's'),
+    'event of numbers': (lambda m: at(20.0, X), TypeError, 'SetpointRequest'),
+    'duration as text': (lambda m: run_loop(controller(m), Process(
+        build('two_tanks'), 0, X, X), duration='10 s'), TypeError, 'duration'),
 }
 
 
@@ -171,7 +248,10 @@ def test_a_wrong_call_is_a_sentence(tanks, call):
     with pytest.raises(kind) as raised:
         attempt(tanks)
     assert words in str(raised.value)
-    assert 'Traceback' not in str(raised.value)
+    # raised by this package, or by Python for the call itself
+    *_, last = traceback.extract_tb(raised.value.__traceback__)
+    assert isinstance(raised.value, OSError) or Path(last.filename) == Path(__file__) or Path(
+        koopman_ros.__file__).parent in Path(last.filename).parents, last.filename
 
 
 @pytest.mark.parametrize('given', [
@@ -181,3 +261,18 @@ def test_numbers_of_any_kind_work(tanks, given):
     state, command, _ = controller(tanks, **given).step(State(), pd.Series(X), 1_000_000_000)
     assert np.all(np.isfinite(command))
     assert controller(tanks, **given).step(state, list(X), 2_000_000_000)[1] is not None
+
+
+def test_lists_integers_and_gaps_work(tanks):
+    loop = controller(tanks, fallback_order=['sdre', 'linear'], controlled=['level_1', 'level_2'])
+    run = run_loop(loop, Process(build('two_tanks'), np.int64(0), [0.1, 0.15], [6, 6]),
+                   at(5, SetpointRequest(0, [0.1, 0.15])), duration=20, period=5)
+    assert run.setpoints[-1] == pytest.approx([0.1, 0.15])
+    for gap in (np.nan, None):
+        assert np.all(np.isfinite(loop.step(State(), [gap, 0.1], np.int64(1))[1]))
+
+
+def test_a_reason_prints_its_sentence(tanks):
+    _, refused = controller(tanks).request_setpoint(State(), [9.0, 0.15])
+    assert 'level_1' in str(refused)
+    assert 'StatusCode' not in f'{refused}'

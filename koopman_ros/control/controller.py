@@ -153,6 +153,8 @@ class Controller:
         :raises TypeError: for a time that is not an integer.
         :raises ValueError: for a measurement or an input of another size.
         """
+        if not isinstance(state, State):
+            expect(state=(state, State))  # which says what is wrong
         return self.calculation.step(
             state, y, time_ns, applied, countable, disturbances, ages, quality)
 
@@ -167,6 +169,7 @@ class Controller:
             predicts.
         :return: as :meth:`step`; the command is None before the first.
         """
+        expect(state=(state, State))
         return self.calculation.hold(state, time_ns, cause)
 
     # Requests of the operator.
@@ -187,6 +190,7 @@ class Controller:
         :return: the new state and None, or the old one with the reason of rejection.
         :raises ValueError: for signals that are not controlled, or that do not fit the value.
         """
+        expect(state=(state, State))
         asked, every = self.controlled.names if signals is None else signals, self.controlled
         if not asked or len(set(asked)) != len(asked) or not set(asked) <= set(every.names):
             raise ValueError(f'signals must be some of {", ".join(every.names)}, each once, got '

@@ -6,6 +6,7 @@
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 import math
+import reprlib
 from typing import Any, cast
 
 import numpy as np
@@ -70,7 +71,7 @@ def real(value: ArrayLike, name: str) -> Array:
     try:
         return np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f'{name} must be numbers ({error})') from error
+        raise ValueError(f'{name} must be numbers, got {reprlib.repr(value)}') from error
 
 
 def frozen(value: ArrayLike, name: str, shape: tuple[int | None, ...], *, finite: bool = True

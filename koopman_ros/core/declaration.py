@@ -20,12 +20,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, Field, field, fields, is_dataclass, replace
 import inspect
 import math
+from numbers import Real
 import textwrap
 from typing import Any, TypeVar
 
 import numpy as np
 
-from koopman_ros.core.arrays import Array
+from koopman_ros.core.arrays import Array, real
 
 __all__ = ['UNBOUNDED', 'Column', 'NoParameters', 'Settings', 'column', 'for_signals', 'group',
            'nested', 'of_other_states', 'parameter', 'per_signal', 'plugin_parameters',
@@ -45,6 +46,7 @@ class Settings:
 
     Its docstring gets a list of them. In Python and YAML one number stands for no bound.
 
+    :raises TypeError: for a value of another type, naming the field.
     :raises ValueError: for a number that is none or out of its range, naming field and value.
     """
 
@@ -57,10 +59,9 @@ class Settings:
         for item in fields(self):  # type: ignore[arg-type]
             value, of = getattr(self, item.name), item.metadata.get('column')
             if of is None:
-                if isinstance(item.default, float):
-                    _check_range(item.name, _numbers(item.name, value), item.metadata)
+                _check_kind(item, value)
                 continue
-            numbers = _numbers(item.name, value)
+            numbers = real(value, item.name)
             if of.none is not None and np.any(numbers == of.none[0]):
                 numbers = np.where(numbers == of.none[0], of.none[1], numbers)
                 object.__setattr__(self, item.name, numbers)
@@ -218,6 +219,23 @@ def _described(name: str, item: Field[Any]) -> list[str]:
                            subsequent_indent='    ')]
 
 
+def _check_kind(item: Field[Any], value: Any) -> None:
+    """Check a value that is not one of each of some signals."""
+    kind = item.metadata.get('nested', type(item.default))
+    if 'nested' in item.metadata or isinstance(item.default, (bool, str)):
+        if not isinstance(value, kind):
+            raise TypeError(f'{item.name} must be of the class {kind.__name__}, got {value!r}')
+    elif isinstance(item.default, tuple):
+        if isinstance(value, str) or not all(isinstance(one, str) for one in value):
+            raise TypeError(f'{item.name} must be a list of names, got {value!r}')
+    elif isinstance(item.default, float):
+        if not isinstance(value, Real):
+            raise TypeError(f'{item.name} must be a number, got {value!r}')
+        _check_range(item.name, np.array(value, dtype=np.float64), item.metadata)
+    elif not all(map(is_dataclass, value.values())):
+        raise TypeError(f'{item.name} must be parameters of plug-ins by name, got {value!r}')
+
+
 def _range_words(minimum: float, maximum: float, opened: bool) -> str:
     low, high = (abs(one) < UNBOUNDED for one in (minimum, maximum))
     above = f'{"above" if opened else "at least"} {minimum:.10g}' * low
@@ -226,16 +244,9 @@ def _range_words(minimum: float, maximum: float, opened: bool) -> str:
         ' and '.join(filter(None, (above, below))))
 
 
-def _numbers(name: str, value: Any) -> Array:
-    try:
-        return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f'{name} must be numbers, got {value!r}') from error
-
-
 def _one_each(name: str, value: Any, signals: Sequence[str], metadata: Mapping[str, Any]
               ) -> Array:
-    array = _numbers(name, value)
+    array = real(value, name)
     if array.ndim == 0:
         array = np.full(len(signals), array)
     if array.shape != (len(signals),):

@@ -10,12 +10,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from koopman_ros.core.arrays import Array, frozen
+from koopman_ros.core.arrays import Array, frozen, real
 
 
 def numbers(name: str, value: ArrayLike, signals: Sequence[str], remedy: str = '') -> Array:
     """Return one number for each of some signals (n,) as an array; ValueError for another size."""
-    array = np.asarray(value, dtype=np.float64)
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = real(value, name)  # which says what is wrong
     if array.shape != (len(signals),):
         raise _wrong_size(name, array, signals, remedy)
     return array

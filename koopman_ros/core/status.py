@@ -184,6 +184,10 @@ class Reason:
     #: names the signal whose unit they have
     values: Mapping[str, Value] = field(default_factory=dict)
 
+    def __str__(self) -> str:
+        """Write it as a sentence, without units, which it does not know."""
+        return StatusFormatter(Displays({}))(self)
+
     @property
     def cause(self) -> Reason | None:
         """The reason behind this one."""

@@ -6,9 +6,10 @@
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 import math
+from numbers import Real
 import os
 from pathlib import Path
-from typing import Protocol, Self, TypeAlias
+from typing import Protocol, runtime_checkable, Self, TypeAlias
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from koopman_ros.control.laws import Feedback, feedback, Weights
 from koopman_ros.control.laws.base import Target
 from koopman_ros.control.state import State, StepReport
 from koopman_ros.control.steady_state import steady_state_target
-from koopman_ros.core.arrays import Array, frozen, short_repr
+from koopman_ros.core.arrays import Array, expect, frozen, short_repr
 from koopman_ros.core.plots import draw_limits, drawing
 from koopman_ros.core.signals import per_signal
 from koopman_ros.core.status import reason, StatusFormatter
@@ -30,6 +31,7 @@ from koopman_ros.model import LiftedModel
 Sensor: TypeAlias = Callable[[Array, float], Array | None]
 
 
+@runtime_checkable
 class Plant(Protocol):
     """The plant in the loop, e.g. ``plants.Process``."""
 
@@ -76,6 +78,13 @@ class ScheduledChange:
 
     seconds: float  #: from the start of the simulation
     what: Event | Change  #: an event of the controller, or a function of the loop
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.seconds, Real):
+            raise TypeError(f'the time of an event must be a number of s, got {self.seconds!r}')
+        if not (isinstance(self.what, Event) or callable(self.what)):
+            raise TypeError('an event must be one of the controller, as in at(20.0, '
+                            f'SetpointRequest(0, [0.1])), got {self.what!r}')
 
 
 def at(seconds: float, what: Event | Change) -> ScheduledChange:
@@ -157,7 +166,8 @@ class LoopRun:
             panels[-1].set_xlabel('time [s]')
 
 
-def run_loop(controller: Controller, plant: Plant, events: Iterable[ScheduledChange] = (), *,
+def run_loop(controller: Controller, plant: Plant,
+             events: Iterable[ScheduledChange] | ScheduledChange = (), *,
              duration: float, period: float = 1.0, C: Array | None = None,
              noise: Array | None = None, seed: int = 0, sensor: Sensor = perfect,
              input_sensor: Sensor | None = None, state: State | None = None,
@@ -175,7 +185,7 @@ def run_loop(controller: Controller, plant: Plant, events: Iterable[ScheduledCha
         run.draw('loop.png')
 
     :param plant: at the start; its present time is that of the first sample.
-    :param events: events with their times; those of the same time in the given order.
+    :param events: one or more, with their times; those of the same time in the given order.
     :param duration: in s, as the period between samples.
     :param C: (n_y, n) measurement matrix of the plant's state, y = C x; by default that of the
         controller, whose model then has the plant's states.
@@ -189,6 +199,10 @@ def run_loop(controller: Controller, plant: Plant, events: Iterable[ScheduledCha
     :param disturbances: (n_d,) measured at a time in s, NaN for one that is not; None for none.
     :raises ValueError: when arguments do not fit each other, or the controller rejects an event.
     """
+    expect(controller=(controller, Controller), plant=(plant, Plant))
+    for name, value in (('duration', duration), ('period', period)):
+        if not isinstance(value, Real):
+            raise TypeError(f'{name} must be a number of s, got {value!r}')
     for name, value, fits in (('duration', duration, duration >= 0.0),
                               ('period', period, period > 0.0)):
         if not (fits and math.isfinite(value)):
@@ -198,6 +212,10 @@ def run_loop(controller: Controller, plant: Plant, events: Iterable[ScheduledCha
     if noise is not None:
         noise = np.asarray(noise, dtype=np.float64)
         per_signal('noise', noise, controller.measured.names)
+    events = list(events) if isinstance(events, Iterable) else [events]
+    if wrong := [one for one in events if not isinstance(one, ScheduledChange)]:
+        raise TypeError('events must be made by at, as in [at(20.0, SetpointRequest(0, [0.1]))], '
+                        f'got {wrong[0]!r}')
     waiting = sorted(events, key=lambda event: event.seconds)
     loop = Loop(controller, state or State(), plant)
     start_ns, rows, reports, failure = plant.time_ns, [], [], ''
@@ -235,6 +253,9 @@ def run_loop(controller: Controller, plant: Plant, events: Iterable[ScheduledCha
 
 def _outputs(controller: Controller, plant: Plant, C: Array | None) -> Callable[[Array], Array]:
     n, outputs = len(plant.x), controller.measured
+    if len(plant.u) != controller.model.n_u:
+        raise ValueError(f'the plant has {len(plant.u)} inputs and the model '
+                         f'{controller.model.n_u}: give the plant of the model')
     if C is not None:
         C = np.asarray(C, dtype=np.float64)
         if C.shape != (len(outputs.names), n):

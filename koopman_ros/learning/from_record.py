@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from numbers import Integral
 from typing import Any
 
 from koopman_ros.core.arrays import expect
@@ -55,6 +56,18 @@ def learn(record: Record, *, test: Record | None = None, disturbances: Sequence[
     known = sorted({one.name for one in fields(TrainingTask)} - set(_OF_RECORD))
     if unknown := ', '.join(name for name in settings if name not in known):
         raise TypeError(f'unknown setting {unknown}: choose from {", ".join(known)}')
+    for name, count, least in (('unmeasured_states', unmeasured_states, -1), ('seed', seed, 0)):
+        if not isinstance(count, Integral):
+            raise TypeError(f'{name} must be an integer, got {count!r}')
+        if count < least:
+            raise ValueError(f'{name} = {count} must be at least {least}')
+    for one in fields(TrainingTask):
+        value = dead_time or {} if one.name == 'dead_time' else settings.get(one.name, {})
+        if one.default_factory is dict and not isinstance(value, Mapping):
+            raise TypeError(f'{one.name} must be by name of the signal, as in '
+                            f'{{{record.plant.input_names[0]!r}: 3.0}}, got {value!r}')
+    if on_progress is not None and not callable(on_progress):
+        raise TypeError(f'on_progress must be a function of share and text, got {on_progress!r}')
     about = record.plant
     # tables have no topics: those that the names would usually have stand for them
     states = tuple(RecordedState(name, unit, place(name, name, unit)) for name, unit in zip(

@@ -12,8 +12,9 @@ from typing import cast
 
 import numpy as np
 
-from koopman_ros.core.arrays import Array, short_repr
-from koopman_ros.core.units import NANOSECONDS
+from koopman_ros.core.arrays import Array, expect, short_repr
+from koopman_ros.core.signals import numbers
+from koopman_ros.core.units import NANOSECONDS, nanoseconds
 from koopman_ros.plants.simulation import advance
 from koopman_ros.plants.system import ArrayFunction, ControlAffineSystem
 
@@ -70,6 +71,14 @@ class Process:
     pending: tuple[tuple[int, int, float], ...] = ()
 
     __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        expect(system=(self.system, ControlAffineSystem))
+        about = self.system
+        for name, value in (('time_ns', nanoseconds(self.time_ns)),
+                            ('x', numbers('x', self.x, about.state_names)),
+                            ('u', numbers('u', self.u, about.input_names))):
+            object.__setattr__(self, name, value)
 
     @property
     def followed(self) -> Array:

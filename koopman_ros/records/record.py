@@ -156,7 +156,10 @@ def _names(names: Names, argument: str) -> list[str]:
         raise TypeError(f'{argument} must be a name or a list of names, got a '
                         f'{type(names).__name__}: the file or table is the first argument of '
                         'read(source, states, inputs)')
-    return [names] if isinstance(names, str) else list(names)
+    found = [names] if isinstance(names, str) else list(names)
+    if wrong := [one for one in found if not isinstance(one, str)]:
+        raise TypeError(f'{argument} must be names of columns, got {wrong[0]!r}')
+    return found
 
 
 def _check_names(states: Sequence[SignalColumn], inputs: Sequence[SignalColumn],

@@ -394,6 +394,7 @@ class Tanks:
 
     def __init__(self, model, load, x, u, time_ns=0):
         self.model, self.load, self.x, self.u, self.time_ns = model, load, x, u, time_ns
+        self.applied = u
 
     def commanded(self, command, _):
         return Tanks(self.model, self.load, self.x, command, self.time_ns)

@@ -54,7 +54,7 @@ def test_a_field_has_unit_range_default_and_parameter(kind: type[Settings], line
     (Tuning, {'hold_timeout': '60 s'}, ('hold_timeout', "'60 s'")),
     (MPCParameters, {'time_limit': 1e5}, ('time_limit = 1', '3600'))])
 def test_a_wrong_value_fails_where_it_is_written(kind, given, words):
-    with pytest.raises(ValueError) as raised:
+    with pytest.raises((TypeError, ValueError)) as raised:
         kind(**given)
     for one in words:
         assert one in str(raised.value)
