@@ -43,7 +43,13 @@ class _Limits(Settings):
 
 @dataclass(frozen=True)
 class InputLimits(_Limits):
-    """Range and rate limits of the inputs."""
+    """
+    Range and rate limits of the inputs.
+
+    >>> limits = InputLimits(lower=0.0, upper=[12.0, 10.0], rate=2.0)
+    >>> limits.within([13.0, 5.0]).tolist()
+    [12.0, 5.0]
+    """
 
     lower: Array = value_column('inputs', 0.0, 'Smallest command.', name='min')
     upper: Array = value_column('inputs', 0.0, 'Largest command.', name='max')
@@ -58,7 +64,12 @@ class InputLimits(_Limits):
 
 @dataclass(frozen=True)
 class SensorLimits(_Limits):
-    """Limits of the sensors and of the rates of their signals, one number per measured signal."""
+    """
+    Limits of the sensors and of the rates of their signals, one number per measured signal.
+
+    >>> float(SensorLimits(lower=0.0, upper=0.6, jump=0.005).at_rest)
+    0.005
+    """
 
     lower: Array = value_column(
         'measured', -UNBOUNDED, 'Lower end of the sensor range.', name='sensor_min')
@@ -115,6 +126,11 @@ class Tuning(Settings):
     The tuning of a controller, in the units of the model's signals.
 
     A field of each of some signals takes one number for all of them, or an array.
+
+    >>> tuning = Tuning.for_model(model, state_weight=1e4, observer_bandwidth=0.05,
+    ...                           limits=InputLimits(lower=0.0, upper=12.0, rate=2.0))
+    >>> tuning.observer_bandwidth, tuning.safe_value.shape
+    (0.05, (2,))
     """
 
     state_weight: Array = column(

@@ -3,6 +3,7 @@
 
 """The public names: from a record to a closed loop, and what wrong calls say."""
 
+import doctest
 import importlib
 import inspect
 from pathlib import Path
@@ -25,6 +26,7 @@ from koopman_ros import (
     Process,
     read,
     run_loop,
+    save,
     SetpointRequest,
     simulate,
     State,
@@ -79,6 +81,29 @@ def test_a_public_name_says_what_it_is(name):
     assert text, name
     assert f'`{name}`' in koopman_ros.__doc__
     assert name in dir(koopman_ros)
+
+
+@pytest.fixture
+def examples(tanks, result, tmp_path, monkeypatch):
+    """Return the names of the examples, in a folder with a table and a model."""
+    monkeypatch.chdir(tmp_path)
+    table().to_csv('log.csv', index=False)
+    save(tanks, 'two_tanks.safetensors')
+    plant = build('two_tanks')
+    names = {name: getattr(koopman_ros, name) for name in koopman_ros.__all__}
+    return {**names, 'model': tanks, 'controller': controller(tanks), 'result': result,
+            'plant': Process(plant, 0, plant.nominal_state, plant.nominal_input)}
+
+
+@pytest.mark.parametrize('name', [
+    name for name in koopman_ros.__all__ if name not in ('FreeRun', 'simulate')])
+def test_the_example_of_a_public_name_runs(name, examples):
+    runner, said = doctest.DocTestRunner(verbose=False), []
+    example = doctest.DocTestParser().get_doctest(
+        inspect.getdoc(getattr(koopman_ros, name)), examples, name, None, 0)
+    assert example.examples, f'{name} has no example'
+    with quick_retraining(4, degrees=(1, 2)):
+        assert runner.run(example, out=said.append).failed == 0, ''.join(said)
 
 
 def test_another_name_is_none():

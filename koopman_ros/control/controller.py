@@ -45,11 +45,13 @@ class Controller:
     It has levels (a law and an estimator each), an order in which the supervisor chooses among
     them, the estimation by the estimators, and a step that uses these.
 
-    Example::
+    >>> controller = Controller(model, Tuning.for_model(model))
+    >>> state, refused = controller.request_setpoint(State(), [0.1, 0.15])
+    >>> state, command, report = controller.step(state, [0.11, 0.14], 1_000_000_000)
+    >>> command.shape, report.level
+    ((2,), 'sdre')
 
-        controller = Controller(model, Tuning.for_model(model))
-        state, command, report = controller.step(State(), measured, time_ns)
-
+    :raises TypeError: for a model or a tuning that is none.
     :raises ValueError: when the tuning does not fit the model's signals, or the measured signals
         do not suffice for the estimator.
     """

@@ -45,7 +45,16 @@ class Silence:
 
 @dataclass(frozen=True, slots=True)
 class SetpointRequest:
-    """The operator requests a set-point."""
+    """
+    The operator requests a set-point.
+
+    Of all controlled signals, or of some:
+
+    >>> SetpointRequest(0, [0.1, 0.15]).value
+    [0.1, 0.15]
+    >>> SetpointRequest(0, [0.12], ('level_1',)).signals
+    ('level_1',)
+    """
 
     stamp_ns: int  #: time at which it takes effect; 0: immediately
     value: Array  #: of the signals, in the model's units

@@ -40,7 +40,15 @@ class Mode(Enum):
 
 
 class State(NamedTuple):
-    """All that a controller remembers between two measurements."""
+    """
+    All that a controller remembers between two measurements.
+
+    The first one knows nothing:
+
+    >>> state, command, report = controller.step(State(), [0.1, 0.15], 5_000_000_000)
+    >>> state.time_ns
+    5000000000
+    """
 
     mode: Mode = Mode.AUTOMATIC  #: who commands
     #: requested, active and scheduled set-points

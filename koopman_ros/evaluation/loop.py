@@ -88,7 +88,14 @@ class ScheduledChange:
 
 
 def at(seconds: float, what: Event | Change) -> ScheduledChange:
-    """Declare an event at a time in s, before the measurement of that time."""
+    """
+    Declare an event at a time in s, before the measurement of that time.
+
+    >>> at(20.0, SetpointRequest(0, [0.1, 0.15])).seconds
+    20.0
+
+    :raises TypeError: for a time that is not a number, or an event that is none.
+    """
     return ScheduledChange(seconds, what)
 
 
@@ -115,7 +122,16 @@ def after_a_second(time_ns: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class LoopRun:
-    """The trajectories of a loop, one row per sample."""
+    """
+    The trajectories of a loop, one row per sample.
+
+    It is made by :func:`run_loop`:
+
+    >>> run = run_loop(controller, plant, duration=20.0, period=5.0)
+    >>> run.times.tolist(), run.states.shape
+    ([0.0, 5.0, 10.0, 15.0, 20.0], (5, 2))
+    >>> run.draw('loop.png')
+    """
 
     times: Array  #: (N,) in s from the start
     states: Array  #: (N, n) of the plant
@@ -178,11 +194,12 @@ def run_loop(controller: Controller, plant: Plant,
     Run a controller and a plant, sampled at 0, period, 2 period, ... up to the duration.
 
     A sample measures, lets the controller answer and gives its command to the plant. The same
-    arguments give the same numbers. Example::
+    arguments give the same numbers.
 
-        run = run_loop(controller, plant, [at(20.0, SetpointRequest(0, [0.1, 0.15]))],
-                       duration=400.0, period=5.0)
-        run.draw('loop.png')
+    >>> run = run_loop(controller, plant, at(20.0, SetpointRequest(0, [0.1, 0.15])),
+    ...                duration=400.0, period=5.0)
+    >>> run.states[-1].round(3).tolist()
+    [0.1, 0.15]
 
     :param plant: at the start; its present time is that of the first sample.
     :param events: one or more, with their times; those of the same time in the given order.
@@ -197,6 +214,7 @@ def run_loop(controller: Controller, plant: Plant,
     :param stamp: the stamp of a measurement at a time of the plant, both in ns.
     :param stop: ends the simulation when it is true of state, command and report.
     :param disturbances: (n_d,) measured at a time in s, NaN for one that is not; None for none.
+    :raises TypeError: for an argument of another type, such as a plant that does not run.
     :raises ValueError: when arguments do not fit each other, or the controller rejects an event.
     """
     expect(controller=(controller, Controller), plant=(plant, Plant))

@@ -31,6 +31,11 @@ def export_c(controller: Controller, folder: str | PathLike[str], *, name: str =
     ``NAME.c`` and ``NAME.h`` are the loop, ``test_vectors.c`` and ``timer_loop.c`` examples,
     ``test_vectors.csv`` calls with the answers of the controller.
 
+    >>> export_c(controller, 'tanks', name='tanks', calls=20)
+    >>> from pathlib import Path
+    >>> Path('tanks', 'tanks.c').exists()
+    True
+
     :param name: prefix of functions, types, macros and include guard, so that several loops fit in
         one program.
     :param sample_period: shortest time between two calls in s; by default the sample interval of

@@ -31,12 +31,13 @@ def learn(record: Record, *, test: Record | None = None, disturbances: Sequence[
 
     Dead times, unmeasured states and the equations are found from the record, a lift is learned
     of them, and closed loops and a free run of the record judge it, as in the program `learn`, the
-    trainer node and the panel. Nothing is written. Example::
+    trainer node and the panel. Nothing is written.
 
-        record = read('log.csv', ['temperature [degC]'], ['heater [percent]'])
-        result = learn(record)
-        print(result)
-        result.save('heater.safetensors')
+    >>> record = read('log.csv', 'level', 'pump')
+    >>> result = learn(record, unmeasured_states=0)
+    >>> result.accepted, result.dead_time.tolist()
+    (True, [3.0])
+    >>> result.save('tank.safetensors')
 
     :param record: measurements, of :func:`read`.
     :param test: record of the same signals that takes no part in the training.

@@ -39,7 +39,16 @@ def _of_plant(about: PlantAcceptance) -> dict[str, object]:
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """Result of a training."""
+    """
+    Result of a training.
+
+    It is made by :func:`learn`, and prints what was found and how well it simulates the record.
+
+    >>> result.accepted, result.reasons
+    (True, ())
+    >>> result.model.inputs.names
+    ('pump',)
+    """
 
     task: TrainingTask  #: the task
     account: ImportReport  #: counts of used and dropped measurements

@@ -68,7 +68,12 @@ class LiftedModel:
     drift stay those of the plant.
 
     All methods work in scaled deviations from the nominal point (see :class:`Coordinates`),
-    with time in `time_unit`. With a network without hidden units it is a linearisation.
+    with time in `time_unit`. With a network without hidden units it is a linearisation. It is
+    made by :func:`learn` or read from a file:
+
+    >>> model = load('two_tanks.safetensors')
+    >>> model.states.names, model.inputs.units
+    (('level_1', 'level_2'), ('V', 'V'))
 
     :raises ValueError: naming the array that does not fit and both shapes.
     """

@@ -68,6 +68,8 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
     """
     Write a model; a reader sees the old file or the new one, never a part.
 
+    >>> save(model, 'copy.safetensors')
+
     :raises OSError: when the folder cannot be written.
     :raises TypeError: for another lift than of a network or of monomials.
     :raises ValueError: when :func:`load` would reject the file.
@@ -80,7 +82,14 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
 
 
 def load(path: str | os.PathLike[str]) -> LiftedModel:
-    """Read and check a model; raise ModelFileError with the reason and the remedy."""
+    """
+    Read and check a model.
+
+    >>> load('two_tanks.safetensors').inputs.names
+    ('pump_1', 'pump_2')
+
+    :raises ModelFileError: with the reason and the remedy.
+    """
     return load_with_digest(path)[0]
 
 

@@ -54,7 +54,10 @@ def plant_class(name: str) -> Any:
 def build(plant: Any, values: Mapping[str, float] | None = None,
           nominal_state: ArrayLike | None = None) -> ControlAffineSystem:
     """
-    Build a plant, e.g. ``build('two_tanks')``.
+    Build a plant.
+
+    >>> build('two_tanks').input_names
+    ('pump_1', 'pump_2')
 
     :param plant: its name, or its class, see :func:`plant_class`.
     :param values: constants in SI, by name, as :func:`constants_of` has them; the default of each

@@ -59,7 +59,18 @@ class Actuator:
 
 @dataclass(frozen=True, eq=False)
 class Process:
-    """A running plant: its equations, present time and state, and its input."""
+    """
+    A running plant: its equations, present time and state, and its input.
+
+    Each method returns the plant as it is then; none changes it.
+
+    >>> tanks = build('two_tanks')
+    >>> plant = Process(tanks, 0, tanks.nominal_state, tanks.nominal_input)
+    >>> plant.commanded(tanks.nominal_input, 0).until(60_000_000_000).time_ns
+    60000000000
+
+    :raises ValueError: for a state or an input that does not fit the system.
+    """
 
     system: ControlAffineSystem  #: the plant
     time_ns: int  #: present time, in integer nanoseconds so that instants repeat exactly

@@ -30,7 +30,15 @@ _BAGS = ('.mcap', '.db3')
 
 @dataclass(frozen=True)
 class Record:
-    """Measurements of a plant, with the names and units of its signals."""
+    """
+    Measurements of a plant, with the names and units of its signals.
+
+    It is made by :func:`read`:
+
+    >>> record = read('log.csv', 'level', 'pump')
+    >>> record.plant.state_units, len(record.episodes)
+    (('m',), 1)
+    """
 
     plant: PlantDescription  #: its nominal point is NaN and its B None, as they are not known yet
     episodes: tuple[Episode, ...]  #: times in s since the first measurement of each
@@ -85,10 +93,14 @@ def read(source: Source, states: Names, inputs: Names, *, time: str = '', period
     """
     Read a record of a plant from tables or bags.
 
-    A signal is the column of its name, with the unit in the header or in the argument::
+    A signal is the column of its name, with the unit in the header or in the argument:
 
-        record = read('day_1.csv', states='level', inputs='pump')          # level [m], pump [V]
-        record = read(frame, ['temperature [K]'], ['heater = HC12.OUT [percent]'])
+    >>> record = read('log.csv', states='level', inputs='pump')          # level [m], pump [V]
+    >>> record = read({'t [min]': list(range(20)), 'TI1 [degC]': 20 * [20.0],
+    ...                'HC12.OUT': 20 * [50.0]},
+    ...               ['temperature = TI1 [K]'], ['heater = HC12.OUT [percent]'], time='t')
+    >>> record.episodes[0].time[:2].tolist(), record.episodes[0].x[0].tolist()
+    ([0.0, 60.0], [293.15])
 
     Where both have a unit, values are converted to that of the argument. A signal without a unit
     has the unit 1. A cell without a number is a missing measurement of that signal alone: NaN in
