@@ -20,7 +20,7 @@ From a table to a closed loop, without ROS:
 ``export_c``                              the loop as C code
 ========================================  ===================================================
 
-Each has an example, and settings their fields with units and defaults: ``help(koopman_ros.Tuning)``.
+Each has an example, and settings list their fields: ``help(koopman_ros.Tuning)``.
 """
 
 from importlib import import_module

@@ -42,7 +42,7 @@ class TrainingResult:
     """
     Result of a training.
 
-    It is made by :func:`learn`, and prints what was found and how well it simulates the record.
+    It is made by :func:`learn`, and prints structure, verdict and errors in a free run.
 
     >>> result.accepted, result.reasons
     (True, ())
