@@ -126,6 +126,9 @@ class Recorder:
                         wanted.reliability, wanted.durability):
                     continue
                 self._end([topic])
+            before = usual if existing is None else existing.qos_profile
+            if wanted.reliability is not before.reliability:
+                self._node.get_logger().info(topics.followed(topic, wanted, publishers))
             self._subscriptions[topic] = self._subscribed(topic, message_type, wanted)
             self._missed.watch(self._subscriptions[topic])
 

@@ -104,6 +104,12 @@ def matching_profile(usual: QoSProfile, publishers: Collection[TopicEndpointInfo
         latched=all(o.durability is DurabilityPolicy.TRANSIENT_LOCAL for o in offers))
 
 
+def followed(topic: str, profile: QoSProfile, publishers: Collection[TopicEndpointInfo]) -> str:
+    """Return the text by which a subscription says that it is as reliable as its publishers."""
+    return (f'{topic}: subscribed {profile.reliability.short_key.replace("_", " ")}, as published '
+            f'by {", ".join(sorted(map(node_name, publishers)))}')
+
+
 def message_class(type_name: str) -> Any:
     """Return the class of a ``package/msg/Name``; LookupError where it is not installed."""
     try:
@@ -222,9 +228,7 @@ class EndpointMonitor:
         profile.reliability = wanted
         self._node.destroy_subscription(own)
         made = make(profile)
-        self._node.get_logger().info(
-            f'{topic}: subscribed {wanted.short_key.replace("_", " ")}, as published by '
-            + ', '.join(sorted(map(node_name, publishers))))
+        self._node.get_logger().info(followed(topic, profile, publishers))
         return made
 
     def _conflict(self, topic: str) -> str:

@@ -26,7 +26,7 @@ SENSOR = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 def test_loop_of_two_sensors(ros: Harness, tmp_path: Path) -> None:
     given = {'system': 'two_tanks', **TYPES}
     controller = ros.start('controller', {**given, 'stuck_sensor_timeout': 0.0})
-    ros.start('trainer', {**given, 'output': tmp_path / 'bag'})
+    trainer = ros.start('trainer', {**given, 'output': tmp_path / 'bag'})
     commands = ros.listen(JointState, 'pump_1_setpoint')
     sensors = {name: ros.node.create_publisher(Float64, name, SENSOR) for name in LEVELS}
 
@@ -36,11 +36,12 @@ def test_loop_of_two_sensors(ros: Harness, tmp_path: Path) -> None:
 
     ros.node.create_timer(0.1, measure)
     ros.wait_until(lambda: len(commands) > 20)
-    output = controller.output()
-    assert 'have no stamp' in output
-    assert 'synchronisation_tolerance' in output
-    assert all(f'/{name}: subscribed best effort, as published by /bench' in output
-               for name in LEVELS)
+    assert 'have no stamp' in controller.output()
+    assert 'synchronisation_tolerance' in controller.output()
+    for node in (controller, trainer):
+        ros.wait_until(lambda node=node: all(
+            f'/{name}: subscribed best effort, as published by /bench' in node.output()
+            for name in LEVELS), node.output)
     assert ros.set_bool('trainer/record', False).success
     (path,) = tmp_path.glob('bag*')
     episodes, _ = loop_episodes([path], STATES, INPUTS)
