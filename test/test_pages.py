@@ -409,7 +409,9 @@ def _check_command(command: list[str], folder: Path) -> None:
               | ['koopman_ros', 'param', node, name, value]):
             assert (row := _row(node.removeprefix('/'), DEFAULT_SYSTEM, name)), name
             assert not _wrong(row, yaml.safe_load(value)), name
-        case ['ros2', 'topic', 'pub', *_, topic, kind, message]:
+        # without -w one message may be sent before its subscribers are known
+        case ['ros2', 'topic', 'pub', '-w', count, '--once', topic, kind, message]:
+            assert int(count) > 0
             assert _topics()[topic.removeprefix('/')] == kind
             topics.message_class(kind)(**yaml.safe_load(message))
         case ['koopman_ros', 'pub', topic, message]:

@@ -5,8 +5,10 @@
 
 from collections.abc import Mapping
 import math
+from pathlib import Path
+import re
 
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from sensor_msgs.msg import JointState
 
 from koopman_ros.ros import topics
@@ -14,6 +16,7 @@ from koopman_ros.testing import Harness
 
 LOW, HIGH = 0.05, 0.2  # m; with the upper level HIGH no pump keeps the lower one at LOW
 LEVELS = ('level_1', 'level_2')
+PAGE = (Path(__file__).parents[2] / 'docs' / 'how-to' / 'operate.md').read_text()
 
 
 class Operator:
@@ -82,6 +85,13 @@ def test_both_are_set_in_one_message(ros: Harness) -> None:
     # the lower one alone cannot go there
     operator.ask(level_2=0.07)
     operator.rejected()
+    # as the page reads the answer
+    (answers,) = re.findall(
+        r'ros2 topic echo --once /diagnostics -f --filter "(.*)"', PAGE)
+    heard = ros.listen(DiagnosticArray, '/diagnostics')
+    ros.wait_until(lambda: any(eval(answers, {'m': message}) for message in heard))
+    first = next(message for message in heard if eval(answers, {'m': message}))
+    assert any('cannot be held' in status.message for status in first.status)
     operator.ask(level_1=0.06, level_2=0.07)
     operator.tracked({'level_1': 0.06, 'level_2': 0.07})
     ros.wait_for_status('controller: requests', lambda s: s.level == DiagnosticStatus.OK)
