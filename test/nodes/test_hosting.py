@@ -19,6 +19,7 @@ from std_msgs.msg import String
 from koopman_ros.core.paths import model_path
 from koopman_ros.demo import reactor
 from koopman_ros.nodes import controller
+from koopman_ros.parameters.signal_topics import bundled_plants
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, NodeProcess
 from support.controller_bench import STEADY
@@ -236,3 +237,17 @@ def test_program_of_which_no_loop_is_left_ends(
              'controller: cannot start: -r __ns:=/elsewhere would apply to all loops', 1)):
         assert run_here(controller, *given, *loops) == 1
         assert capfd.readouterr().err.count(words) == count
+
+
+def test_shipped_plants_start_without_a_warning(ros: Harness, tmp_path: Path) -> None:
+    """All by their own parameter files, in one process: their safe inputs suit their models."""
+    plants = bundled_plants()
+    parameters = tmp_path / 'site.yaml'
+    parameters.write_text('\n'.join(
+        f'/{name}/controller:\n  ros__parameters: {{system: {name}}}' for name in plants))
+    process = start(ros, 'controller', plants, '--params-file', str(parameters))
+    for name in plants:
+        assert ros.get_parameters(f'/{name}/controller', 'system') == [name]
+        ros.wait_for_status(f'{name}/controller: control', lambda s: (
+            value(s, 'safe input') == 'within reach'))
+    assert 'WARN' not in process.output()
