@@ -469,7 +469,8 @@ def test_a_sender_of_manual_commands_that_has_gone_is_a_warning(bench: Bench) ->
 
 
 def test_of_two_clocks_one_may_have_died_and_diagnostics_have_their_time(
-        ros: Harness, run_node: RunNode, monkeypatch: pytest.MonkeyPatch) -> None:
+        ros: Harness, run_node: RunNode, monkeypatch: pytest.MonkeyPatch,
+        capfd: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(controller_status, '_PATIENCE', 0.5)
     clocks = [ros.node.create_publisher(Clock, '/clock', topics.CLOCK_QOS) for _ in range(2)]
     arrays = ros.listen(DiagnosticArray, '/diagnostics')
@@ -479,9 +480,12 @@ def test_of_two_clocks_one_may_have_died_and_diagnostics_have_their_time(
     def said(task: str, words: str) -> bool:
         clocks[0].publish(Clock(clock=temperature(0.0, next(seconds)).header.stamp))
         status = ros.last_status(f'controller: {task}')
-        return status is not None and words in status.message
+        return status is not None and status.level == DiagnosticStatus.WARN and (
+            words in status.message)
 
     ros.wait_until(lambda: said('connections', '2 nodes publish the time: /bench, /bench'))
+    assert '[WARN]' in next(line for line in capfd.readouterr().err.splitlines()
+                            if '2 nodes publish the time' in line)
     ros.wait_until(lambda: said('connections', 'has died'))
     # no measurement that is old, as there was none
     ros.wait_until(lambda: said('measurements', 'no measurement was received for'))
