@@ -208,12 +208,18 @@ class ParameterTable(Generic[T]):
         for name, row in self.rows.items():
             if reason := row.check(every[name]):
                 raise ConfigurationError(reason)
-        for low, high in self._ordered_rows():
-            if not every[low] < every[high]:
-                raise ConfigurationError(f'{self._given(low, every)} must be below '
-                                         f'{self._given(high, every)}: change the other one first')
+        self._check_order(every)
         made: T = self._make(every)
+        # two may be equal in the units of the calculation
+        self._check_order(self.values(made))
         return made
+
+    def _check_order(self, values: Mapping[str, Any]) -> None:
+        for low, high in self._ordered_rows():
+            if not values[low] < values[high]:
+                raise ConfigurationError(
+                    f'{self._given(low, values)} must be below {self._given(high, values)}: '
+                    'change the other one first')
 
     def values(self, snapshot: T) -> dict[str, Any]:
         """Return the values of a snapshot by name."""

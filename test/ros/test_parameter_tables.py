@@ -166,7 +166,7 @@ def declared(ros: Harness, *arguments: str, name: str = 'odd',
     ('plant', ('speed:=[]',), 'speed = [] must be a double, e.g. 1.0'),
     ('controller', ('coolant_temperature.min:=20.0',
                     'coolant_temperature.max:=20.00000000000001'),
-     'coolant_temperature.min = 20.0 degC and coolant_temperature.max = 20.0 degC is not usable'),
+     'coolant_temperature.min = 20.0 degC must be below coolant_temperature.max'),
     ('trainer', ('max_bag_size:=1.0e+308',),
      'max_bag_size = 1e+308 MB must be 0, or in [1e-06, 1000000000] MB'),
 ])
