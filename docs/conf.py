@@ -27,6 +27,7 @@ myst_heading_anchors = 3
 autodoc_mock_imports = ['builtin_interfaces', 'cloudpickle', 'diagnostic_msgs', 'distributed',
                         'joblib', 'lifecycle_msgs', 'matplotlib', 'rcl_interfaces', 'rclpy',
                         'rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs', 'torch', 'tqdm',
+                        'trajectory_msgs',
                         # panel
                         'fastapi', 'nicegui', 'starlette', 'uvicorn']
 autodoc_typehints = 'description'
