@@ -202,9 +202,10 @@ def _described(name: str, item: Field[Any]) -> list[str]:
     """Return the lines of a docstring about a field."""
     about, of = item.metadata, item.metadata.get('column')
     if 'description' not in about:
-        kind = about.get('nested')
-        return [f'``{name}``: ' + ('own parameters of laws and estimators, by name' if kind is None
-                                  else f'see ``{kind.__name__}``')]
+        if (kind := about.get('nested')) is None:
+            return [f'``{name}``: by name', '    Own parameters of laws and estimators.']
+        return [f'``{name}``: see ``{kind.__name__}``',
+                f'    {inspect.cleandoc(kind.__doc__).splitlines()[0]}']
     unit = about['unit'].replace('{shown}', 'its unit').replace('({unit})', '(its unit)').replace(
         '{unit}', 'its unit')
     default = item.default if of is None else of.default
