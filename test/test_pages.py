@@ -33,7 +33,7 @@ from koopman_ros.parameters.trainer_table import preset_wiring
 from koopman_ros.ros import node_descriptions, topics
 from koopman_ros.ros.controller_messages import active_constraints
 from koopman_ros.testing import isolated_domain
-from studies import exported_loops, late_reactor
+from studies import acceptance, exported_loops, late_reactor
 from studies.records.table import table_of as records_table
 from support.heater_logs import write_heater_logs
 from support.nodes import type_support
@@ -213,6 +213,16 @@ def test_table_of_a_late_coolant_is_that_of_its_summary_and_keeps_its_bounds() -
             # of 10 K
             assert found['overshoot_kelvin'] < 0.7
             assert found['cost'] < 1.05 * summary['least_cost']
+
+
+def test_page_of_the_acceptance_has_the_figures_of_its_summary_and_its_bound_holds() -> None:
+    trainings = json.loads((ROOT / 'docs/results/acceptance.json').read_text())['trainings']
+    page = (ROOT / 'docs/results/validation.md').read_text()
+    assert all(line in page for line in acceptance.coverage(trainings))
+    accepted = [one for one in trainings.values() if one['accepted']]
+    covered = sum(one['true_failed'] <= one['bound'] * one['true_loops'] for one in accepted)
+    assert covered >= 0.95 * len(accepted) > 100
+    assert {key.partition('/')[0] for key in trainings} == set(acceptance.CASES)
 
 
 def test_page_of_the_c_code_has_the_figures_of_its_summary() -> None:
