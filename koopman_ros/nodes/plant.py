@@ -16,6 +16,7 @@ from std_srvs.srv import Trigger
 
 from koopman_ros import plants
 from koopman_ros.core.message_fields import base_name
+from koopman_ros.core.time_base import TimeBase
 from koopman_ros.core.units import (
     LAST_STAMP_SECONDS,
     NANOSECONDS,
@@ -92,6 +93,8 @@ class PlantNode(ManagedNode):
                 place.topic: f'publish the {name}' for name, place in (
                     *wiring.measured.items(), *wiring.measured_disturbances.items())} | (
                 {topics.CLOCK: 'publish the time'} if clock else {}))
+        self._sources = endpoints.sources = {
+            place.topic: TimeBase(late=-1) for place in wiring.commands.values()}
         self._command_subscriber = SignalSubscriber(
             self, endpoints.subscribe, wiring.commands, signals.inputs, self._on_command)
         self._clock_publisher = endpoints.publish(
@@ -257,6 +260,9 @@ class PlantNode(ManagedNode):
     def _on_command(self, received: SignalSample) -> None:
         if not self.active:
             return
+        if received.number is not None:
+            self._sources[received.topic].take(
+                received.number, time.monotonic(), self._command_patience)
         lockstep = self._settings.lockstep
         if lockstep and received.stamped and received.stamp_ns != self._plant.process.time_ns:
             # it answers no open measurement: late, or from another node
@@ -366,9 +372,13 @@ class PlantNode(ManagedNode):
         """Return whether commands of an input are missing."""
         if self._phase is not RunPhase.RUNNING or self._settings.lockstep:
             return self._waiting_in_vain
-        period = self._settings.sample_period / (self._settings.speed or math.inf)
-        silence = time.monotonic() - min(self._commanded.values())
-        return silence > max(_SILENCE, 5.0 * period)
+        return time.monotonic() - min(self._commanded.values()) > self._command_patience
+
+    @property
+    def _command_patience(self) -> float:
+        """Seconds within which the controller commands the inputs several times."""
+        return max(_SILENCE, 5.0 * self._settings.sample_period / (
+            self._settings.speed or math.inf))
 
 
 def main(args: list[str] | None = None) -> int:

@@ -70,6 +70,7 @@ class Measurements:
         # by topic of the measurements with one publisher: the numbers of its messages
         self._sources = {place.topic: TimeBase(late=-1) for place in wiring.measured.values()
                          if place.topic in exclusive}
+        endpoints.sources = self._sources
         self._inputs = SignalSubscriber(
             node, endpoints.subscribe, wiring.applied, signals.inputs, self._on_applied)
         # the first command begins from them
@@ -100,7 +101,7 @@ class Measurements:
         :param begun: whether there was a command, before which the measured inputs are awaited.
         """
         self._timing, self._window, self._commanded, self._active = timing, window, commanded, True
-        self._sources = {topic: TimeBase(late=-1) for topic in self._sources}
+        self._sources.update((topic, TimeBase(late=-1)) for topic in self._sources)
         self._wait.clear()
 
     def end(self) -> None:

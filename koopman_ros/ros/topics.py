@@ -28,6 +28,7 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
 from koopman_ros.core.plugins import load_plugin
+from koopman_ros.core.time_base import TimeBase
 from koopman_ros.parameters.signal_topics import (
     ACTIVE_CONSTRAINTS,
     AUDIT_LOG,
@@ -130,11 +131,14 @@ class EndpointMonitor:
 
     :param on_change: called when the complaint is another.
     :param exclusive: the verb phrase for topics on which only one node may publish.
+    :ivar sources: the numbers of the messages on those that the node receives. By them, a second
+        publisher of the same name that sends is told from one that has died.
     """
 
     def __init__(self, node: HostedNode, on_change: Callable[[], None],
                  exclusive: Mapping[str, str] | None = None) -> None:
         self._node, self._on_change, self._exclusive = node, on_change, exclusive or {}
+        self.sources: Mapping[str, TimeBase] = {}
         self._publishers: list[Publisher] = []
         # with a function that subscribes by another profile, None where a parameter sets it
         self._subscriptions: list[tuple[
@@ -238,8 +242,11 @@ class EndpointMonitor:
             type_name(kind) for name, kind in TYPES.items() if name == topic}
         names = sorted(node_name(info) for info in self._node.get_publishers_info_by_topic(topic)
                        if info.topic_type in kinds)
-        # a crashed node is known until its lease has expired
-        died = ', unless one has died just now' * (len(set(names)) < len(names))
+        # a crashed node is known until its lease has expired; the messages tell whether one sends
+        source = self.sources.get(topic, TimeBase())
+        if (counted := source.newest is not None) and not source.conflict:
+            names = sorted(set(names))
+        died = ', unless one has died just now' * (len(set(names)) < len(names) and not counted)
         return '' if len(names) < 2 else (
             f'{len(names)} nodes {self._exclusive[topic]}: {", ".join(names)}; stop all but one'
             f'{died}')

@@ -366,6 +366,29 @@ def test_other_publishers_are_named_while_they_exist(bench: Bench) -> None:
     bench.status(lambda s: (s.level, s.message) == (DiagnosticStatus.OK, 'running'))
 
 
+def test_a_second_publisher_of_one_name_is_named_once_it_sends(bench: Bench) -> None:
+    """The middleware knows one that was killed until its lease has expired."""
+    bench.wait_for_more(1)
+    silent = bench.ros.node.create_publisher(
+        Temperature, reactor.COOLANT_SETPOINT, topics.LOOP_QOS)
+    other = Node('other', context=bench.ros.node.context)
+    other.create_publisher(Temperature, f'/{reactor.COOLANT_SETPOINT}', topics.LOOP_QOS)
+    # the plant has found both
+    status = bench.status(lambda s: '/other' in s.message and 'another node' not in s.message)
+    assert status.message == '2 nodes command the coolant: /bench, /other; stop all but one'
+    other.destroy_node()
+    bench.status(lambda s: s.level == DiagnosticStatus.OK)
+
+    def send() -> bool:
+        silent.publish(Temperature(header=bench.measured[-1].header, temperature=bench.coolant))
+        return '/bench, /bench' in bench.ros.last_status(STATUS).message
+
+    bench.ros.wait_until(send)
+    assert 'has died' not in bench.ros.last_status(STATUS).message
+    bench.ros.node.destroy_publisher(silent)
+    bench.status(lambda s: (s.level, s.message) == (DiagnosticStatus.OK, 'running'))
+
+
 def test_the_time_of_an_inactive_plant_does_not_advance(
         shared_ros: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
     clock = SimpleNamespace(now=100.0)

@@ -516,6 +516,26 @@ def test_a_controller_that_is_gone_has_a_banner_until_it_is_back(site: Site) -> 
         expect(card(page, 'Controller')).not_to_have_attribute('inert', '')
 
 
+def test_a_controller_that_was_killed_is_not_a_second_one(site: Site) -> None:
+    """The middleware knows it for minutes."""
+    with site.page() as page:
+        ready(page)
+        site.controller.stop(signal.SIGKILL)
+        expect(page.locator('header')).to_contain_text('MODE NOT KNOWN')
+        site.controller = site.ros.start('controller')
+        expect(page.locator('header')).to_contain_text('AUTOMATIC')
+        begun = len(site.ros.statuses)
+
+        def of_plant() -> list[str]:
+            return [status.message for status in site.ros.statuses[begun:]
+                    if status.name == 'plant: simulation']
+
+        site.ros.wait_until(lambda: len(of_plant()) > 3)
+        assert not any('2 nodes' in message for message in of_plant())
+        page.goto(f'{site.url}/alarms')
+        expect(card(page, 'Active alarms')).not_to_contain_text('2 nodes')
+
+
 def test_a_page_finds_its_panel_again(site: Site) -> None:
     """The one that comes back has no users: whoever reaches it is the operator."""
     port = int(site.url.rpartition(':')[2])
