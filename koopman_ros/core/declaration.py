@@ -64,7 +64,7 @@ class Settings:
             numbers = real(value, item.name)
             if of.none is not None and np.any(numbers == of.none[0]):
                 numbers = np.where(numbers == of.none[0], of.none[1], numbers)
-                object.__setattr__(self, item.name, numbers)
+            object.__setattr__(self, item.name, numbers if numbers.ndim else float(numbers))
             _check_range(item.name, numbers, item.metadata)
 
 

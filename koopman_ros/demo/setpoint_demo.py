@@ -29,6 +29,7 @@ from koopman_ros.demo.loop import Row, run_loop, running_loop, Scenario
 from koopman_ros.demo.results import DemoRun, read_run
 from koopman_ros.evaluation.optimal_cost import (
     cost_along,
+    keeps,
     linear_law,
     OptimalTrajectory,
     optimum,
@@ -49,7 +50,8 @@ PLANT = 'reactor'
 _PANEL_SPEED = 10.0  # at most, of a loop with the panel
 _STYLES: dict[str, dict[str, Any]] = {
     'linear law': {'color': 'tab:red'},
-    'optimum': {'color': 'black', 'linestyle': (0, (1, 2)), 'linewidth': 1.5}}
+    'optimum': {'color': 'black', 'linestyle': (0, (1, 2)), 'linewidth': 1.5},
+    'optimum without limits': {'color': '0.5', 'linestyle': (0, (1, 2)), 'linewidth': 1.5}}
 
 
 @dataclass(frozen=True)
@@ -124,11 +126,16 @@ def run_plant(name: str, export: bool, output: Path, speed: float) -> dict[str, 
     task = Task(system, states[0], *steady_state(system, setpoints),
                 tuning.state_weight, tuning.input_weight,
                 plant.sample_period / system.seconds_per_time_unit, len(states) - 1)
-    trajectories = {'linear law': linear_law(task), 'optimum': optimum(task)}
-    linear, best = trajectories.values()
+    before = system.nominal_input if first == 0 else np.array([
+        values[first - 1] for values in run.commanded.values()])
+    linear, best = linear_law(task, tuning.limits, before), optimum(task)
+    fair = keeps(task, best, tuning.limits, before)
+    trajectories = {'linear law': linear,
+                    'optimum' if fair else 'optimum without limits': best}
     cost = cost_along(task, states, inputs[:-1])
-    title = (f'{system.name}: {change}. Cost over the optimum without rate limit: learned '
-             f'{cost / best.cost:.4f}, linear {linear.cost / best.cost:.4f}')
+    title = _conclusion(f'{system.name}: {change}', run, linear, setpoints, signals) + (
+        f'\nCost over the optimum: {cost / best.cost:.3f}, linear law {linear.cost / best.cost:.3g}'
+        if fair else '')
     _draw(picture, title, run, trajectories, signals, scenario, model.states, tuning, code)
     counts = summary(bag).counts
     result: dict[str, object] = {
@@ -152,6 +159,18 @@ def run_plant(name: str, export: bool, output: Path, speed: float) -> dict[str, 
     return result
 
 
+def _conclusion(task: str, run: DemoRun, linear: OptimalTrajectory, setpoints: Mapping[str, float],
+                signals: Signals) -> str:
+    """Say how near the set-points both controllers end."""
+    own, other = (' and '.join(
+        f'{abs(error):.1g} {unit_label(signals.states[signal])}'
+        for signal, error in errors.items()) for errors in (
+        {signal: run.final_error(signal, goal) for signal, goal in setpoints.items()},
+        {signal: float(linear.states[-1, list(signals.states).index(signal)] - goal)
+         for signal, goal in setpoints.items()}))
+    return f'{task}\nThe learned controller ends {own} off, the linear law {other}'
+
+
 def _draw(path: Path, title: str, run: DemoRun, trajectories: Mapping[str, OptimalTrajectory],
           signals: Signals, scenario: Scenario, box: Coordinates, tuning: Tuning,
           code: ExportedLoop | None) -> None:
@@ -173,17 +192,13 @@ def _draw(path: Path, title: str, run: DemoRun, trajectories: Mapping[str, Optim
                 panel.plot([scenario.step_time, run.seconds[-1]],
                            [float(shown(setpoint, unit))] * 2, 'k--', linewidth=1.0,
                            label='set-point')
-                panel.text(
-                    0.99, 0.06, f'ends {run.final_error(signal, setpoint):+.1e} off, linear law '
-                    f'{trajectories["linear law"].states[-1, i] - setpoint:+.1e} [{unit}]',
-                    transform=panel.transAxes, ha='right', fontsize=8)
             panel.plot(run.seconds, shown(run.measured[signal], unit), **learned)
             for name, trajectory in trajectories.items():
                 # a course that diverges stays at the edge
                 values = np.clip(np.nan_to_num(shown(trajectory.states[:, i], unit), nan=high),
                                  2.0 * low - high, 2.0 * high - low)
                 panel.plot(times(values), values, label=name, **_STYLES[name])
-            panel.set_ylabel(f'{signal} [{unit_label(unit)}]')
+            panel.set_ylabel(f'{signal.replace("_", " ")} [{unit_label(unit)}]')
         for j, ((signal, unit), panel) in enumerate(zip(
                 signals.inputs.items(), panels[len(signals.states):], strict=True)):
             low, high = (float(shown(float(end[j]), unit))
@@ -202,7 +217,7 @@ def _draw(path: Path, title: str, run: DemoRun, trajectories: Mapping[str, Optim
                 values = np.clip(np.nan_to_num(shown(trajectory.inputs[:, j], unit), nan=high),
                                  low, high)
                 panel.step(times(values), values, where='post', label=name, **_STYLES[name])
-            panel.set_ylabel(f'{signal} [{unit_label(unit)}]')
+            panel.set_ylabel(f'{signal.replace("_", " ")} [{unit_label(unit)}]')
         panels[0].set_title(title, fontsize=9)
         panels[-1].set(xlabel='plant time [s]', xlim=(0.0, run.seconds[-1]))
         legend(figure, panels, 6 if code is None else 4)

@@ -15,6 +15,7 @@ from koopman_ros.core.integration import integrate
 from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.core.steady_state import Goal, steady_state
 from koopman_ros.plants.system import ControlAffineSystem
+from koopman_ros.tuning import InputLimits
 
 _MAX_ITERATIONS = 200
 _SHORTEST_STEP = 2.0 ** -20
@@ -54,12 +55,16 @@ def cost_along(task: Task, states: Array, inputs: Array) -> float:
     return float(np.sum(_after_a_period(task, y, inputs)[:, -1]))
 
 
-def linear_law(task: Task) -> OptimalTrajectory:
+def linear_law(task: Task, limits: InputLimits | None = None,
+               before: Array | None = None) -> OptimalTrajectory:
     """
     Apply the linear-quadratic law of the plant linearised at its nominal point.
 
     Its feed-forward is its own: the input that, to the linearised plant, holds the weighted
     states at the set-point.
+
+    :param limits: of the inputs; none by default.
+    :param before: (n_u,) input before the start, from which the rate counts; by default nominal.
     """
     system = task.system
     A, weighted = system.slope(system.nominal_state, system.nominal_input), task.Q > 0.0
@@ -73,7 +78,21 @@ def linear_law(task: Task) -> OptimalTrajectory:
     assert y is not None  # the nominal point is one
     x, u = np.split(y * unit, [n])
     K = solve_riccati(A, B, np.diag(task.Q), np.diag(task.R)).K
-    return _constant_law(task, system.nominal_input + u, K, system.nominal_state + x)
+    return _constant_law(task, system.nominal_input + u, K, system.nominal_state + x, limits,
+                         system.nominal_input if before is None else before)
+
+
+def keeps(task: Task, trajectory: OptimalTrajectory, limits: InputLimits, before: Array) -> bool:
+    """Return whether the inputs of a trajectory keep range and rate, but for rounding."""
+    last = np.vstack([before, trajectory.inputs[:-1]])
+    wanted = _limited(task, trajectory.inputs, last, limits)
+    return bool(np.allclose(trajectory.inputs, wanted, rtol=1e-9, atol=0.0))
+
+
+def _limited(task: Task, u: Array, last: Array, limits: InputLimits) -> Array:
+    """Return the inputs nearest to u that keep the range, and the rate after the last ones."""
+    change = limits.rate * task.period * task.system.seconds_per_time_unit
+    return limits.within(np.minimum(np.maximum(u, last - change), last + change))
 
 
 def optimum(task: Task) -> OptimalTrajectory:
@@ -108,12 +127,15 @@ def optimum(task: Task) -> OptimalTrajectory:
                      f'could still fall by {gain:.3g}; shorten the horizon or the period')
 
 
-def _constant_law(task: Task, u: Array, K: Array, x: Array) -> OptimalTrajectory:
+def _constant_law(task: Task, u: Array, K: Array, x: Array, limits: InputLimits | None = None,
+                  before: Array | None = None) -> OptimalTrajectory:
     return _roll_out(task, np.tile(u, (task.samples, 1)), np.tile(K, (task.samples, 1, 1)),
-                     np.tile(x, (task.samples, 1)))
+                     np.tile(x, (task.samples, 1)), limits, before)
 
 
-def _roll_out(task: Task, inputs: Array, K: Array, about: Array) -> OptimalTrajectory:
+def _roll_out(task: Task, inputs: Array, K: Array, about: Array,
+              limits: InputLimits | None = None, before: Array | None = None
+              ) -> OptimalTrajectory:
     """Apply inputs[k] - K[k] (x - about[k]): (N, n_u), (N, n_u, n_x) and (N or more, n_x)."""
     states, applied = np.empty((len(inputs) + 1, task.system.n_x)), np.empty_like(inputs)
     y = np.append(task.x0, 0.0)
@@ -121,6 +143,8 @@ def _roll_out(task: Task, inputs: Array, K: Array, about: Array) -> OptimalTraje
         for k, u in enumerate(inputs):
             states[k] = y[:-1]
             applied[k] = u - K[k].dot(states[k] - about[k])
+            if limits is not None and before is not None:
+                applied[k] = before = _limited(task, applied[k], before, limits)
             y = _after_a_period(task, y, applied[k])
     states[-1] = y[:-1]
     return OptimalTrajectory(states, applied, float(y[-1]) if np.all(np.isfinite(y)) else math.inf)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_continuous_are, solve_discrete_are
 
-from koopman_ros.evaluation.optimal_cost import cost_along, linear_law, optimum, Task
+from koopman_ros.evaluation.optimal_cost import cost_along, keeps, linear_law, optimum, Task
 from koopman_ros.plants import ControlAffineSystem, plant_class, two_state_example
+from koopman_ros.tuning import InputLimits
 
 A = np.array([[0.5, 1.0, 0.0], [-1.0, 0.2, 0.3], [0.0, 0.4, -0.8]])
 B = np.array([[0.0, 0.2], [1.0, 0.0], [0.0, 0.7]])
@@ -84,3 +85,16 @@ def test_a_plant_that_no_law_holds_is_named():
     with pytest.raises(ValueError, match=r'law does not stabilise .* a = 1, b = -2'):
         optimum(replace(TASK, system=runaway))
     assert linear_law(replace(TASK, system=runaway)).cost == np.inf
+
+
+def test_the_linear_law_keeps_range_and_rate_from_the_input_before():
+    limits = InputLimits(lower=[-0.6, -1.0], upper=[0.9, 1.0], rate=[0.5, np.inf])
+    before, free = np.array([0.2, 0.0]), linear_law(TASK)
+    limited = linear_law(TASK, limits, before)
+    assert np.all(limited.inputs >= limits.lower)
+    assert np.all(limited.inputs <= limits.upper)
+    changes = np.abs(np.diff(np.vstack([before, limited.inputs])[:, 0]))
+    assert np.max(changes) == pytest.approx(0.5 * TASK.period)
+    assert keeps(TASK, limited, limits, before)
+    assert not keeps(TASK, free, limits, before)
+    assert limited.cost > free.cost
