@@ -20,7 +20,7 @@ import numpy as np
 
 from koopman_ros.core.paths import model_path
 from koopman_ros.core.plots import draw_limits, drawing, DRAWN_RANGE, legend, write_figures
-from koopman_ros.core.units import conversion, display_unit, shown, unit_label
+from koopman_ros.core.units import conversion, display_unit, printed, shown, unit_label
 from koopman_ros.demo.console import LiveTable, read_options, run_demo
 from koopman_ros.demo.exported import ExportedLoop
 from koopman_ros.demo.line_demo import PLANT as LINE
@@ -134,8 +134,8 @@ def run_plant(name: str, export: bool, output: Path, speed: float) -> dict[str, 
                     'optimum' if fair else 'optimum without limits': best}
     cost = cost_along(task, states, inputs[:-1])
     title = _conclusion(f'{system.name}: {change}', run, linear, setpoints, signals) + (
-        f'\nCost over the optimum: {cost / best.cost:.3f}, linear law {linear.cost / best.cost:.3g}'
-        if fair else '')
+        f'\nCost over the optimum: {cost / best.cost:.3f}, linear law '
+        f'{linear.cost / best.cost:.3g}' if fair else '')
     _draw(picture, title, run, trajectories, signals, scenario, model.states, tuning, code)
     counts = summary(bag).counts
     result: dict[str, object] = {
@@ -163,7 +163,7 @@ def _conclusion(task: str, run: DemoRun, linear: OptimalTrajectory, setpoints: M
                 signals: Signals) -> str:
     """Say how near the set-points both controllers end."""
     own, other = (' and '.join(
-        f'{abs(error):.1g} {unit_label(signals.states[signal])}'
+        f'{abs(error):.2g} {printed(signals.states[signal])}'.removesuffix(' 1')
         for signal, error in errors.items()) for errors in (
         {signal: run.final_error(signal, goal) for signal, goal in setpoints.items()},
         {signal: float(linear.states[-1, list(signals.states).index(signal)] - goal)
