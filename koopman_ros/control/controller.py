@@ -65,6 +65,8 @@ class Controller:
 
     def __post_init__(self) -> None:
         expect(model=(self.model, LiftedModel), tuning=(self.tuning, Tuning))
+        if self.outputs is not None:
+            expect(outputs=(self.outputs, Outputs))
         object.__setattr__(self, 'tuning', self.tuning.for_signals(
             self.model, self.measured.names))
         # reject now if a part cannot be built, and keep the built parts
@@ -172,6 +174,8 @@ class Controller:
         :return: as :meth:`step`; the command is None before the first.
         """
         expect(state=(state, State))
+        if cause is not None:
+            expect(cause=(cause, StatusCode))
         return self.calculation.hold(state, time_ns, cause)
 
     # Requests of the operator.
@@ -193,7 +197,9 @@ class Controller:
         :raises ValueError: for signals that are not controlled, or that do not fit the value.
         """
         expect(state=(state, State))
-        asked, every = self.controlled.names if signals is None else signals, self.controlled
+        every = self.controlled
+        asked = every.names if signals is None else (
+            (signals,) if isinstance(signals, str) else signals)
         if not asked or len(set(asked)) != len(asked) or not set(asked) <= set(every.names):
             raise ValueError(f'signals must be some of {", ".join(every.names)}, each once, got '
                              f'{list(asked)}')

@@ -15,6 +15,7 @@ from koopman_ros.control.controller import Controller
 from koopman_ros.control.state import Mode, State, StepReport
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.status import Reason, StatusCode
+from koopman_ros.core.units import nanoseconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,12 +55,17 @@ class SetpointRequest:
     [0.1, 0.15]
     >>> SetpointRequest(0, [0.12], ('level_1',)).signals
     ('level_1',)
+
+    :raises TypeError: for a time that is not an integer.
     """
 
     stamp_ns: int  #: time at which it takes effect; 0: immediately
     value: Array  #: of the signals, in the model's units
     #: which of the controlled ones are requested, others are unchanged; None for all
     signals: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        nanoseconds(self.stamp_ns)  # which says what is wrong
 
 
 @dataclass(frozen=True, slots=True)

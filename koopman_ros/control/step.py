@@ -107,6 +107,9 @@ class ControlStep:
         if disturbances is not None and (signals := self.model.disturbances.names):
             disturbances = numbers('measured disturbances', disturbances, signals)
             ages = None if ages is None else numbers('ages of disturbances', ages, signals)
+        if quality is not None and len(quality) != len(y):
+            raise ValueError('quality must have a code for each of '
+                             f'{", ".join(self.estimation.outputs.names)}, got {quality!r}')
         ahead = 1 if state.time_ns is None else time_ns - state.time_ns
         if state.command is not None and -LATE_NANOSECONDS <= ahead <= 0:
             arrival = Arrival.LATE if ahead < 0 else Arrival.REPEATED

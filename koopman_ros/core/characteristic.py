@@ -51,8 +51,9 @@ class Characteristic:
         u, g = (np.asarray(one, dtype=np.float64) for one in (values, effects))
         if not (1 < len(u) == len(g) and np.all(np.diff(u) > 0.0) and np.all(np.diff(g) >= 0.0)
                 and g[-1] > g[0]):
-            raise ValueError('a characteristic needs rising values and effects that do not fall, '
-                             f'got the effects {g.tolist()} at {u.tolist()}')
+            raise ValueError('a characteristic needs pairs of value and effect, values that rise '
+                             'and effects that do not fall, got the effects '
+                             f'{g.tolist()} at {u.tolist()}')
         line, g = (u - u[0]) / (u[-1] - u[0]), (g - g[0]) / (g[-1] - g[0])
         g = u[0] + (u[-1] - u[0]) * ((1.0 - _LEAST_SLOPE) * g + _LEAST_SLOPE * line)
         g[-1] = u[-1]

@@ -67,7 +67,7 @@ class PlantDescription:
                                  (f'nominal_{kind}', nominal)):
                 object.__setattr__(self, attribute, value)
         if unknown := [name for name in self.disturbance_names if name not in self.input_names]:
-            raise ValueError(f'disturbance_names has {", ".join(unknown)}, must be some of the '
+            raise ValueError(f'the disturbances have {", ".join(unknown)}, must be some of the '
                              f'inputs {", ".join(self.input_names)}')
         if self.disturbance_names and (self.input_matrix_degree or callable(self.B)):
             raise ValueError(f'the effect of {", ".join(self.disturbance_names)} must not depend '

@@ -56,12 +56,21 @@ class Settings:
         cls.__doc__ = '\n\n'.join([inspect.cleandoc(cls.__doc__ or ''), '\n'.join(rows)])
 
     def __post_init__(self) -> None:
+        lengths: dict[str, tuple[str, int]] = {}  # of fields and arrays, by signals
         for item in fields(self):  # type: ignore[arg-type]
             value, of = getattr(self, item.name), item.metadata.get('column')
             if of is None:
                 _check_kind(item, value)
                 continue
             numbers = real(value, item.name)
+            if numbers.ndim:
+                if numbers.ndim > 1:
+                    raise ValueError(f'{item.name} must be a number or one per '
+                                     f'{_ONE_OF[of.signals]}, got {numbers.tolist()}')
+                other, length = lengths.setdefault(of.signals, (item.name, len(numbers)))
+                if length != len(numbers):
+                    raise ValueError(f'{other} has {length} numbers and {item.name} '
+                                     f'{len(numbers)}: give one per {_ONE_OF[of.signals]}')
             if of.none is not None and np.any(numbers == of.none[0]):
                 numbers = np.where(numbers == of.none[0], of.none[1], numbers)
             object.__setattr__(self, item.name, numbers if numbers.ndim else float(numbers))

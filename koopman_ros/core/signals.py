@@ -6,6 +6,7 @@
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,14 +14,25 @@ from numpy.typing import ArrayLike
 from koopman_ros.core.arrays import Array, frozen, real
 
 
-def numbers(name: str, value: ArrayLike, signals: Sequence[str], remedy: str = '') -> Array:
-    """Return one number for each of some signals (n,) as an array; ValueError for another size."""
+def numbers(name: str, value: Any, signals: Sequence[str], remedy: str = '') -> Array:
+    """
+    Return one number for each of some signals (n,) as an array.
+
+    :raises ValueError: for another size, or a Series of pandas with the signals in another order.
+    """
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         array = real(value, name)  # which says what is wrong
+    if array.ndim == 0 and len(signals) == 1:
+        array = array[None]
     if array.shape != (len(signals),):
         raise _wrong_size(name, array, signals, remedy)
+    # the rows of a Series of pandas have names
+    own = [str(one) for one in value.index] if hasattr(value, 'iloc') else list(signals)
+    if own != list(signals) and sorted(own) == sorted(signals):
+        raise ValueError(f'the {name} has the order {", ".join(own)}: pass it in the order '
+                         f'{", ".join(signals)}')
     return array
 
 
@@ -41,7 +53,9 @@ def _wrong_size(name: str, value: ArrayLike, signals: Sequence[str], remedy: str
     array = np.asarray(value)
     return ValueError(
         f'incompatible {name}: expected one number for each of {", ".join(signals)}, got '
-        f'{array.tolist()}, {array.size} in place of {len(signals)}'
+        f'{array.tolist()}, ' + (
+            f'{array.size} in place of {len(signals)}' if array.size != len(signals) else
+            f'an array of the shape {array.shape} in place of {(len(signals),)}')
         + f'; {remedy}' * bool(remedy))
 
 

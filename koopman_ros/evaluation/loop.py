@@ -82,6 +82,9 @@ class ScheduledChange:
     def __post_init__(self) -> None:
         if not isinstance(self.seconds, Real):
             raise TypeError(f'the time of an event must be a number of s, got {self.seconds!r}')
+        if not 0.0 <= self.seconds < math.inf:
+            raise ValueError(f'the time of an event is {self.seconds} s, must be finite and at '
+                             'least 0')
         if not (isinstance(self.what, Event) or callable(self.what)):
             raise TypeError('an event must be one of the controller, as in at(20.0, '
                             f'SetpointRequest(0, [0.1])), got {self.what!r}')
@@ -95,6 +98,7 @@ def at(seconds: float, what: Event | Change) -> ScheduledChange:
     20.0
 
     :raises TypeError: for a time that is not a number, or an event that is none.
+    :raises ValueError: for a time below 0, or one that is not finite.
     """
     return ScheduledChange(seconds, what)
 
@@ -234,10 +238,16 @@ def run_loop(controller: Controller, plant: Plant,
     if wrong := [one for one in events if not isinstance(one, ScheduledChange)]:
         raise TypeError('events must be made by at, as in [at(20.0, SetpointRequest(0, [0.1]))], '
                         f'got {wrong[0]!r}')
-    waiting = sorted(events, key=lambda event: event.seconds)
+    waiting, last = sorted(events, key=lambda event: event.seconds), round(duration / period)
+    if last == 0 < duration:
+        raise ValueError(f'period is {period} s, must be at most duration = {duration} s')
+    if waiting and round((late := waiting[-1].seconds) * NANOSECONDS) > round(
+            last * period * NANOSECONDS):
+        raise ValueError(f'the event at {late} s is after the last sample, at {last * period:g} s:'
+                         ' give a longer duration')
     loop = Loop(controller, state or State(), plant)
     start_ns, rows, reports, failure = plant.time_ns, [], [], ''
-    for number in range(round(duration / period) + 1):
+    for number in range(last + 1):
         seconds = number * period
         time_ns = start_ns + round(seconds * NANOSECONDS)
         try:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from koopman_ros import __version__
 from koopman_ros.control import Controller
+from koopman_ros.core.arrays import expect
 from koopman_ros.export.c_code import c_code, ExportError, filled, signals, template
 from koopman_ros.export.cortex_m4 import report
 from koopman_ros.export.vectors import columns, vectors, with_laws
@@ -44,6 +45,7 @@ def export_c(controller: Controller, folder: str | PathLike[str], *, name: str =
     :param laws: commands of a law that are measured on an emulated Cortex-M4F.
     :raises ExportError: for a law, an estimator, a model or a name that cannot be exported.
     """
+    expect(controller=(controller, Controller))
     model, output = controller.model, Path(folder)
     period = model.sample_interval if sample_period is None else sample_period
     if not period > 0.0:

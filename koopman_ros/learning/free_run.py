@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
+from numbers import Integral
 import os
 from pathlib import Path
 from typing import TypeAlias
@@ -15,7 +16,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.optimize import least_squares, OptimizeResult
 
-from koopman_ros.core.arrays import Array, expect, short_repr, show_printed
+from koopman_ros.core.arrays import Array, expect, frozen, short_repr, show_printed
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.plots import drawing
 from koopman_ros.core.solvers import differences
@@ -160,14 +161,21 @@ def simulate(model: AnyModel, record: Record, init: int | None = None, *,
     :param offsets: (M, n_x) known disturbances of the rates in the episodes, in place of that, in
         the order and units of the model per time unit of the record.
     :param picture: file of a picture to draw, ending in .png; none by default.
+    :raises TypeError: for a model or a record that is none.
     :raises ValueError: for a record without the model's signals.
     """
+    if not isinstance(model, AnyModel):
+        raise TypeError(f'model must be a model, as of learn(record).model or load(file), got '
+                        f'{type(model).__name__}')
     expect(record=(record, Record))
+    if init is not None and not isinstance(init, Integral):
+        raise TypeError(f'init must be a number of samples, an integer, got {init!r}')
     rate, states, inputs, dead_time = _drift(model, record.plant)
     measured = [i for i, name in enumerate(states.names) if name in record.plant.state_names]
     if not measured:
-        raise ValueError(f'the record has none of the states {", ".join(states.names)}, it has '
-                         f'{", ".join(record.plant.state_names)}: read those')
+        raise ValueError(f'the record has the states {", ".join(record.plant.state_names)} and '
+                         f'the model {", ".join(states.names)}: read at least one of these from '
+                         f"its column, as in '{states.names[0]} = COLUMN'")
     # the measured states first, where that is not their order already
     order = [*measured, *(i for i in range(len(states)) if i not in measured)]
     some = states.only([states.names[i] for i in measured])
@@ -183,7 +191,9 @@ def simulate(model: AnyModel, record: Record, init: int | None = None, *,
     step = _step(rate, states, episodes)
     if usual is None and offsets is None:
         usual = _usual(model, some.names)
-    known = np.zeros((len(episodes), len(states))) if offsets is None else offsets
+    usual = None if usual is None else frozen(usual, 'usual', (len(measured),), finite=False)
+    known = np.zeros((len(episodes), len(states))) if offsets is None else frozen(
+        offsets, 'offsets', (len(episodes), len(states)))
     indexed = [replace(one, disturbance=own) for one, own in zip(indexed, known, strict=True)]
     found = [_start(rate, states, measured, one, index, init, step, usual)
              for one, index in zip(episodes, indexed, strict=True)]

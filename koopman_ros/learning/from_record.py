@@ -6,8 +6,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
-from numbers import Integral
+from dataclasses import Field, fields
+from numbers import Integral, Real
 from typing import Any
 
 from koopman_ros.core.arrays import expect
@@ -42,7 +42,7 @@ def learn(record: Record, *, test: Record | None = None, disturbances: Sequence[
     :param record: measurements, of :func:`read`.
     :param test: record of the same signals that takes no part in the training.
     :param disturbances: those of its inputs that are measured, not manipulated.
-    :param unmeasured_states: number of states that are not in the record; -1: as many as it needs.
+    :param unmeasured_states: most states that are not in the record; -1: as many as it needs.
     :param dead_time: of inputs by name, in s; of those not named it is found.
     :param model_class: to learn, e.g. ``'linear'``; by default the one that the rule selects.
     :param seed: of the split and of the training.
@@ -57,16 +57,11 @@ def learn(record: Record, *, test: Record | None = None, disturbances: Sequence[
     known = sorted({one.name for one in fields(TrainingTask)} - set(_OF_RECORD))
     if unknown := ', '.join(name for name in settings if name not in known):
         raise TypeError(f'unknown setting {unknown}: choose from {", ".join(known)}')
-    for name, count, least in (('unmeasured_states', unmeasured_states, -1), ('seed', seed, 0)):
-        if not isinstance(count, Integral):
-            raise TypeError(f'{name} must be an integer, got {count!r}')
-        if count < least:
-            raise ValueError(f'{name} = {count} must be at least {least}')
+    settings |= {'disturbances': disturbances, 'unmeasured_states': unmeasured_states,
+                 'dead_time': dead_time or {}, 'model_class': model_class, 'seed': seed}
     for one in fields(TrainingTask):
-        value = dead_time or {} if one.name == 'dead_time' else settings.get(one.name, {})
-        if one.default_factory is dict and not isinstance(value, Mapping):
-            raise TypeError(f'{one.name} must be by name of the signal, as in '
-                            f'{{{record.plant.input_names[0]!r}: 3.0}}, got {value!r}')
+        if one.name in settings:
+            settings[one.name] = _checked(one, settings[one.name], record.plant.input_names)
     if on_progress is not None and not callable(on_progress):
         raise TypeError(f'on_progress must be a function of share and text, got {on_progress!r}')
     about = record.plant
@@ -77,7 +72,31 @@ def learn(record: Record, *, test: Record | None = None, disturbances: Sequence[
         about.input_names, about.input_units, strict=True))
     task = TrainingTask(**{
         'output': '', 'model': '', 'plant': about.name, 'bags': record.sources, 'states': states,
-        'inputs': inputs, 'disturbances': tuple(disturbances), 'model_class': model_class,
-        'unmeasured_states': unmeasured_states, 'dead_time': dict(dead_time or {}), 'seed': seed,
-        **settings})
+        'inputs': inputs, **settings})
     return retrain(task, on_progress, record=record, test=test)
+
+
+def _checked(about: Field[Any], value: Any, inputs: Sequence[str]) -> Any:
+    """Return a setting of a task, one name as a tuple of it; TypeError for another type."""
+    name, default = about.name, about.default
+    if about.default_factory is dict:
+        if not isinstance(value, Mapping):
+            raise TypeError(f'{name} must be by name of the signal, as in {{{inputs[0]!r}: 3.0}}, '
+                            f'got {value!r}')
+        if name in ('dead_time', 'lag'):
+            for signal, seconds in value.items():
+                if not isinstance(seconds, Real):
+                    raise TypeError(f'{name} of {signal} must be a number of s, got {seconds!r}')
+    elif isinstance(default, tuple):
+        value = (value,) if isinstance(value, str) else value
+        if not (isinstance(value, Sequence) and all(isinstance(one, str) for one in value)):
+            raise TypeError(f'{name} must be a list of names, got {value!r}')
+        return tuple(value)
+    elif isinstance(default, int | float):
+        if not isinstance(value, Integral if isinstance(default, int) else Real):
+            words = 'an integer' if isinstance(default, int) else 'a number'
+            raise TypeError(f'{name} must be {words}, got {value!r}')
+        least = {'unmeasured_states': -1, 'starts': 1, 'most_samples': 1000}.get(name, 0)
+        if not float(value) >= least:
+            raise ValueError(f'{name} = {value} must be at least {least}')
+    return value

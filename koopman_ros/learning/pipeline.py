@@ -102,7 +102,7 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
     record = (_read(backend, task, states, inputs, current, progress) if given is None else
               reduced(given.of(*units), task.most_samples, task.seed, hidden=_hidden(task)))
     if not record.episodes:
-        raise ValueError('the bags contain no usable segment of measurements: '
+        raise ValueError('the record holds no usable segment of measurements: '
                          + '; '.join(record.account.lines()))
     seconds = SECONDS_PER_TIME_UNIT[plant.time_unit]
     episodes = [replace(episode, time=episode.time / seconds,

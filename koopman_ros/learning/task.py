@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from koopman_ros.core.arrays import Array
+from koopman_ros.core.arrays import Array, frozen
 from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.datasets import PlantDescription
 from koopman_ros.core.message_fields import MessageField
@@ -194,8 +194,9 @@ def _characteristics(task: TrainingTask, plant: PlantDescription) -> dict[str, C
                             if name not in plant.input_names):
         raise ValueError(f'characteristics name {unknown}: the inputs are '
                          f'{", ".join(plant.input_names)}')
-    return {name: Characteristic.of(points[::2], points[1::2])
-            for name, points in task.characteristics.items()}
+    return {name: Characteristic.of(points[::2], points[1::2]) for name, points in (
+        (name, frozen(points, f'the characteristic of {name}', (None,)))
+        for name, points in task.characteristics.items())}
 
 
 def _known_gain(task: TrainingTask, plant: PlantDescription) -> Array | None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 import safetensors.numpy
 
+from koopman_ros.core.arrays import expect
 from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.paths import write_atomically
 from koopman_ros.core.units import check_unit
@@ -71,9 +72,11 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
     >>> save(model, 'copy.safetensors')
 
     :raises OSError: when the folder cannot be written.
-    :raises TypeError: for another lift than of a network or of monomials.
+    :raises TypeError: for another class than a model, or another lift than of a network or of
+        monomials.
     :raises ValueError: when :func:`load` would reject the file.
     """
+    expect(model=(model, LiftedModel))
     check(model)
     about, tensors = _description(model), _tensors(model)
     metadata = json.dumps({'format_version': FORMAT_VERSION, 'model': about,

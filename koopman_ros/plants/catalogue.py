@@ -63,11 +63,14 @@ def build(plant: Any, values: Mapping[str, float] | None = None,
     :param values: constants in SI, by name, as :func:`constants_of` has them; the default of each
         that is missing.
     :param nominal_state: (n_x,) for a plant that raised EquilibriumError without, only then.
+    :raises TypeError: for a plant that is neither.
     :raises ValueError: for an unknown constant or one outside its range, or for a factory that
         returns no ControlAffineSystem.
     :raises EquilibriumError: if the plant raises it.
     """
     plant = plant_class(plant) if isinstance(plant, str) else plant
+    if not callable(plant):
+        raise TypeError(f"plant must be a name, e.g. 'two_tanks', or a class, got {plant!r}")
     constants = in_plant_units(plant, values or {})
     # a callable need not have a name
     name = getattr(plant, '__name__', type(plant).__name__)

@@ -12,7 +12,7 @@ from typing import cast
 
 import numpy as np
 
-from koopman_ros.core.arrays import Array, expect, short_repr
+from koopman_ros.core.arrays import all_finite, Array, expect, short_repr
 from koopman_ros.core.signals import numbers
 from koopman_ros.core.units import NANOSECONDS, nanoseconds
 from koopman_ros.plants.simulation import advance
@@ -90,6 +90,8 @@ class Process:
                             ('x', numbers('x', self.x, about.state_names)),
                             ('u', numbers('u', self.u, about.input_names))):
             object.__setattr__(self, name, value)
+        if not (all_finite(self.x) and all_finite(self.u)):
+            raise ValueError(f'x = {self.x.tolist()} and u = {self.u.tolist()} must be finite')
 
     @property
     def followed(self) -> Array:

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 import os
 from pathlib import Path
-from typing import TypeAlias
+import reprlib
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from koopman_ros.core.arrays import short_repr, show_printed
+from koopman_ros.core.arrays import expect, short_repr, show_printed
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.message_fields import base_name, place, SIGNAL_NAME
 from koopman_ros.core.units import check_unit, NANOSECONDS
@@ -25,6 +27,7 @@ from koopman_ros.records.tables import SignalColumn, Source, table_of
 #: Names of signals: ``'level'``, ``'level [m]'``, ``'level = LT101.PV [m]'``.
 Names: TypeAlias = str | Sequence[str]
 
+_LONGEST_NAME = 100  # of a plant, in characters, as in model files
 _BAGS = ('.mcap', '.db3')
 
 
@@ -56,6 +59,7 @@ class Record:
         :param inputs: units of the inputs by name.
         :raises ValueError: for a signal that the record does not have, or a unit of another kind.
         """
+        expect(states=(states, Mapping), inputs=(inputs, Mapping))
         about, taken = self.plant, []
         for kind, wanted, names, units in (
                 ('state', states, about.state_names, about.state_units),
@@ -127,9 +131,17 @@ def read(source: Source, states: Names, inputs: Names, *, time: str = '', period
     :raises BagReadError: for a bag that cannot be read.
     :raises ValueError: for a table that cannot be read, or whose times or numbers have more than
         one reading, with row, column and cell.
-    :raises TypeError: for names that are a table, where the arguments are in another order.
+    :raises TypeError: for an argument of another type, as where they are in another order.
     """
+    _check_options(time=(time, str, 'the name of a column'), name=(name, str, 'a text'),
+                   period=(period, Real, 'a number of s'),
+                   tolerance=(tolerance, Real, 'a number of s'),
+                   dayfirst=(dayfirst, bool | None, 'True, False or None'))
     sources = source if isinstance(source, list | tuple) else [source]
+    if not sources:
+        raise ValueError('the list of files and tables is empty: give at least one')
+    if not tolerance >= 0.0:
+        raise ValueError(f'tolerance = {tolerance} s must be at least 0 s')
     of_states, of_inputs = (tuple(map(SignalColumn.of, _names(some, role)))
                             for some, role in ((states, 'states'), (inputs, 'inputs')))
     _check_names(of_states, of_inputs, _names(linear, 'linear'))
@@ -152,15 +164,24 @@ def read(source: Source, states: Names, inputs: Names, *, time: str = '', period
                                  of_states, of_inputs, _names(linear, 'linear'), report)
     report.dropped = +report.dropped
     files = tuple(os.fspath(one) for one in sources if isinstance(one, str | os.PathLike))
+    name = name or Path(files[0] if files else 'plant').stem
+    if not name.isprintable() or len(name) > _LONGEST_NAME:
+        raise ValueError(f'name = {reprlib.repr(name)} of the plant must be at most '
+                         f'{_LONGEST_NAME} printable characters: give a shorter name')
     if not episodes:
         raise ValueError('the record holds no usable segment of measurements: '
                          + '; '.join(report.lines()))
     plant = PlantDescription(
-        name or Path(files[0] if files else 'plant').stem,
-        tuple(one.name for one in of_states), tuple(one.unit for one in of_states),
+        name, tuple(one.name for one in of_states), tuple(one.unit for one in of_states),
         tuple(one.name for one in of_inputs), tuple(one.unit for one in of_inputs),
         's', np.full(len(of_states), np.nan), np.full(len(of_inputs), np.nan), None)
     return Record(plant, tuple(episodes), report, files)
+
+
+def _check_options(**given: tuple[object, Any, str]) -> None:
+    for name, (value, kind, words) in given.items():
+        if not isinstance(value, kind):
+            raise TypeError(f'{name} must be {words}, got {value!r}')
 
 
 def _names(names: Names, argument: str) -> list[str]:

@@ -11,6 +11,7 @@ from functools import cache, partial
 import os
 from pathlib import Path
 import re
+import reprlib
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -324,11 +325,11 @@ def table_of(source: Source, label: str = 'table') -> Table:
     if isinstance(source, Mapping):
         return _of_frame(_columns(source), label)
     if not isinstance(source, str | os.PathLike):
-        raise ValueError(_no_record(f'a {type(source).__name__}'))
+        raise ValueError(_no_record(f'{reprlib.repr(source)}'))
     path = Path(source)
     kind = path.suffix.lower()
     if kind not in (*_TEXT, '.parquet', '.mat'):
-        raise ValueError(_no_record(str(source)))
+        raise ValueError(_no_record(reprlib.repr(str(source)) if '\n' in str(source) else source))
     if path.exists() and not path.is_file():
         raise ValueError(f'{source} is not a file: give a file')
     try:
@@ -357,7 +358,7 @@ def table_of(source: Source, label: str = 'table') -> Table:
                 if kind in _TEXT else ': write it again')) from error
 
 
-def _no_record(what: str) -> str:
+def _no_record(what: object) -> str:
     return (f'{what} is not a record: give a .csv, .parquet, .mat or .mcap file, the folder of a '
             'bag, a DataFrame of pandas, or columns by name; save a workbook as .csv')
 
@@ -388,4 +389,7 @@ def _columns(arrays: Mapping[Any, Any]) -> Any:
             continue
         columns |= {name: values} if values.ndim == 1 else {
             f'{name}_{j + 1}': values[:, j] for j in range(values.shape[1])}
+    if not columns:
+        raise ValueError('the table has no columns of values '
+                         f'({", ".join(map(str, arrays))}): give a list for each name')
     return pd.DataFrame({name: pd.Series(values) for name, values in columns.items()})

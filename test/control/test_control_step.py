@@ -579,15 +579,21 @@ def test_the_filter_follows_a_step_with_its_time_constant():
 @pytest.mark.parametrize(('act', 'message'), [
     (lambda loop, state: loop.step(state, [START, 1.0], NOW + SECOND),
      r'incompatible measurement: expected one number for each of temperature, got \['),
-    (lambda loop, state: loop.step(state, START, NOW + SECOND), 'incompatible measurement: '),
     (lambda loop, state: loop.step(state, [START], NOW + SECOND, [290.0, 290.0]),
      'incompatible applied input: expected one number for each of coolant_temperature, got '),
     (lambda loop, state: loop.initialise(State(), [[290.0]]), 'incompatible applied input: '),
-    (lambda loop, state: loop.request_setpoint(state, SETPOINT), 'incompatible set-point: '),
+    (lambda loop, state: loop.request_setpoint(state, [SETPOINT] * 2), 'incompatible set-point: '),
     (lambda loop, state: loop.request_manual_input(loop.set_mode(state, Mode.MANUAL), []),
      'incompatible manual input: expected one number for each of coolant_temperature, got ')],
-    ids=['measurement', 'no list', 'applied', 'found', 'set-point', 'manual'])
+    ids=['measurement', 'applied', 'found', 'set-point', 'manual'])
 def test_another_size_is_rejected(act, message):
     loop = controller()
     with pytest.raises(ValueError, match=message):
         act(loop, started(loop))
+
+
+def test_one_number_of_one_signal_needs_no_list():
+    loop = controller()
+    _, command, _ = loop.step(started(loop), START, NOW + SECOND)
+    np.testing.assert_array_equal(command, loop.step(started(loop), [START], NOW + SECOND)[1])
+    assert loop.request_setpoint(started(loop), SETPOINT)[1] is None

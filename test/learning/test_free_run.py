@@ -177,7 +177,7 @@ def test_a_disturbance_is_fitted_to_two_time_constants(period, init, count):
 
 
 @pytest.mark.parametrize(('signals', 'options', 'words'), [
-    (('force', 'position'), {}, 'none of the states position, speed, it has force'),
+    (('force', 'position'), {}, 'the states force and the model position, speed'),
     (('position [m]', 'speed'), {}, 'no input force'),
     (('position [s]', 'force'), {}, r"position: .* as 'position \[unit\]'"),
     (('position [m]', 'force [N]'), {'init': 0}, 'init = 0'),
