@@ -218,5 +218,6 @@ class Supervisor:
             return Supervisor(requested.level, why, None, bad_since)
         waiting = self.reason
         if waiting is not None and waiting.code is not RULES[Condition.RECOVERING].code:
-            waiting = order.request(Condition.RECOVERING, cause=waiting).reason
+            waiting = order.request(Condition.RECOVERING, cause=waiting,
+                                    recovery_time=order.recovery_time).reason
         return Supervisor(settled, waiting, None, self.bad_since_ns, since)

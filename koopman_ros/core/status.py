@@ -70,7 +70,7 @@ class StatusCode(Enum):
     HELD_TOO_LONG = 'held_too_long', '{cause}; held for longer than {timeout:g} s'
     RECOVERING = 'recovering', (
         '{cause}: this has ended; the better law acts again when it has stayed away for '
-        'recovery_time')
+        '{recovery_time:g} s')
     SAFE_LATCHED = 'safe_latched', (
         '{cause}; the safe state is latched: remove the cause, then clear it on the panel or by '
         'the service clear_safe_state')

@@ -101,7 +101,7 @@ def _draw_commands(axes: matplotlib.axes.Axes, time: np.ndarray, bag: ReplayedBa
     if new_model:
         axes.step(time, shown(bag.new_commands[:, i], unit), where='post', color=_NEW,
                   linewidth=1.5, label=f'{_short(new_model)} on the same measurements')
-    axes.set_ylabel(f'{name}, command [{unit_label(unit)}]')
+    axes.set_ylabel(f'{name.replace("_", " ")}, command [{unit_label(unit)}]')
 
 
 def _draw_difference(axes: matplotlib.axes.Axes, time: np.ndarray, bag: ReplayedBag, i: int,

@@ -256,7 +256,7 @@ def _draw_drift(axes: Any, retrained: TrainingResult, i: int) -> None:
                  label='estimated from the data')
     axes.set(xlabel=_label(box.states, i),
              ylabel=f'difference of the rate [{box.states.units[i]}/{retrained.plant.time_unit}]',
-             title='rate with the others in the middle: difference from the estimate')
+             title='difference of the rate, the others in the middle')
     axes.legend()
 
 
@@ -266,14 +266,16 @@ def _draw_band(axes: Any, retrained: TrainingResult, band: RateBand, i: int) -> 
     states = retrained.learned.model.states
     x = shown(states.to_physical(band.values)[:, i], states.units[i])
     axes.fill_between(x, *(states.scale[i] * one[:, i] for one in (band.lower, band.upper)),
-                      color='tab:orange', alpha=0.4, linewidth=0.0, label='band')
+                      color='tab:orange', alpha=0.4, linewidth=0.0,
+                      label='plants that the record allows')
     axes.plot(x, states.scale[i] * band.rates[:, i], color='k', label='estimated from the data')
     measured = np.concatenate([one.interpolated()[:, i] for one in retrained.found.episodes])
     axes.plot(shown(measured, states.units[i]), np.full(len(measured), 0.02), '|', alpha=0.1,
-              color='tab:blue', transform=axes.get_xaxis_transform(), label='measurements')
+              color='tab:blue', transform=axes.get_xaxis_transform())
+    axes.plot([], [], '|', color='tab:blue', label='measurements')
     axes.set(xlabel=_label(states, i),
              ylabel=f'rate [{states.units[i]}/{retrained.plant.time_unit}]',
-             title='rate where the data are, with its band')
+             title='rate where the data are, and its band')
     axes.legend()
 
 

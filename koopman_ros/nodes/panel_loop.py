@@ -316,7 +316,8 @@ class PanelLoop:
         entry = AuditEntry.of(action, answer, time.time(), self.view.read.get(action.name, ''))
         self.view.take_action(entry)
         self._operator_actions.publish(String(data=entry.text()))
-        word = 'accepted' if answer.accepted else 'rejected'
+        word = ('accepted' if answer.accepted else
+                'unknown' if answer.text.startswith(UNKNOWN) else 'rejected')
         value = sanitize_text(f'{action.name} {action.value}', _LOGGED)
         self.node.get_logger().info(f'{action.who}: {action.what} {value}: {word}')
         self.snapshot = self.view.snapshot(time.time())

@@ -12,6 +12,7 @@ from typing import Any
 from nicegui import ui
 from nicegui.element import Element
 
+from koopman_ros.core.units import printed
 from koopman_ros.panel.alarms import Alarm, AlarmState, Priority
 from koopman_ros.panel.conditions import grouped
 from koopman_ros.panel.layout import (
@@ -174,7 +175,7 @@ def _row(page: PageLayout, first: Alarm, shelving: Iterable[str], chosen: set[st
             (chosen.add if event.value else chosen.discard)(first.key)
 
     def named(control: Element, what: str) -> Any:
-        return attribute(page.control(control), 'aria-label', f'{what}: {first.text}')
+        return attribute(page.control(control), 'aria-label', f'{what}: {printed(first.text)}')
 
     if chosen is not None:
         select = named(ui.checkbox(on_change=choose).props('dense'), 'Select')
@@ -209,7 +210,7 @@ def _row(page: PageLayout, first: Alarm, shelving: Iterable[str], chosen: set[st
 def _shelved_row(page: PageLayout, first: Alarm) -> Callable[[Alarm, str, Snapshot], None]:
     what, until = label('span', '', 'what'), label('span', '', 'quiet')
     attribute(page.button('Unshelve', lambda: _act(page, 'unshelve', first.key)).props('dense'),
-              'aria-label', f'Unshelve: {first.text}')
+              'aria-label', f'Unshelve: {printed(first.text)}')
 
     def update(alarm: Alarm, _: str, now: Snapshot) -> None:
         what.set_text(alarm.text)

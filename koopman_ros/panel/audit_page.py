@@ -14,6 +14,7 @@ from typing import Any
 
 from nicegui import ui
 
+from koopman_ros.panel.faceplates import readable
 from koopman_ros.panel.layout import box, label, Lines, PageLayout
 from koopman_ros.panel.requests import AuditEntry
 from koopman_ros.panel.snapshot import Snapshot
@@ -41,18 +42,19 @@ def audit_page(page: PageLayout) -> None:
 
 def line_of(entry: AuditEntry) -> str:
     """Write an action for people."""
-    change = ' → '.join(value_text(value) for value in (entry.old, entry.new)
-                        if value not in (None, ''))
+    change = ' → '.join(('off', 'on')[value] if isinstance(value, bool) else value_text(value)
+                        for value in (entry.old, entry.new) if value not in (None, ''))
     when = time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(entry.stamp))
     answer = entry.answer if entry.accepted else f'✖ {entry.answer}'
-    return f'{when}  {entry.who}: {entry.what} {change} {entry.unit}'.rstrip() + f': {answer}'
+    what = readable(entry.what).replace('setpoint', 'set-point')
+    return f'{when}  {entry.who}: {what} {change} {entry.unit}'.rstrip() + f': {answer}'
 
 
 def value_text(value: Any) -> str:
     """Write a value of an action."""
     if isinstance(value, Mapping):
         return ', '.join(f'{name} = {value_text(item)}' for name, item in value.items())
-    return f'{value:.8g}' if isinstance(value, float) else str(value)
+    return f'{value:.6g}' if isinstance(value, float) else str(value)
 
 
 def exported(entries: tuple[AuditEntry, ...]) -> str:

@@ -55,7 +55,7 @@ def span_text(bounds: Range, decimals: int) -> str:
 def pen(kind: str, name: str) -> str:
     """Return the name of the pen of a signal."""
     suffix = {'active_setpoints': ' set-point', 'predicted': ' predicted', 'planned': ' planned',
-              'commands': ' command'}.get(kind, '')
+              'commands': ' command', 'applied': ' applied'}.get(kind, '')
     return f'{name}{suffix}'
 
 

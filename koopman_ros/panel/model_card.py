@@ -23,7 +23,6 @@ _TRAINING = {'step': 'Step', 'model_class': 'Model class',
              'heldout_error': 'Held-out error',
              'heldout_error_of_current_model': 'Held-out error of the current model',
              'heldout_error_of_linear_model': 'Held-out error of a linear model',
-             'closed_loop_statement': 'Closed loops',
              'closed_loops': 'Simulated closed loops', 'closed_loops_failed': 'of these failed',
              'closed_loop_cost_over_linear': 'Closed-loop cost relative to linear control'}
 _LAWS = {'re-centred': 'linear around the set-point',
@@ -84,8 +83,8 @@ def model_changes(now: Snapshot, name: str, new: LiftedModel, trained: Mapping[s
     # the trainer compares with the model of its parameter
     same = training.get('model_file') == name and active == now.parameter(TRAINER, 'model')
     rows += [(f'Error on the new record, {readable(signal)} [{training.get(f"units: {signal}")}]',
-              training.get(f'heldout_error_of_current_model: {signal}', '–'),
-              training[f'heldout_error: {signal}']) for signal in signals if same]
+              brief(training.get(f'heldout_error_of_current_model: {signal}', '–')),
+              brief(training[f'heldout_error: {signal}'])) for signal in signals if same]
     if not (same and signals):
         rows.append(('Error on the same data', 'not known', 'compare on the last hour first'))
     return rows
@@ -95,6 +94,14 @@ def _beyond(one: Range, other: Range) -> list[Range]:
     """Return the parts of a range outside another."""
     parts = (one[0], min(one[1], other[0])), (max(one[0], other[1]), one[1])
     return [part for part in parts if part[0] < part[1]]
+
+
+def brief(value: str) -> str:
+    """Write a figure with four digits; other texts stay."""
+    try:
+        return f'{float(value):.4g}' if '.' in value else value
+    except ValueError:
+        return value
 
 
 def training_card(values: Mapping[str, str]) -> dict[str, str]:

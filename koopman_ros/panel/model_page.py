@@ -17,7 +17,13 @@ from koopman_ros.core.units import printed
 from koopman_ros.model import load
 from koopman_ros.panel.faceplates import readable
 from koopman_ros.panel.layout import AnswerLine, box, label, PageLayout, show_if
-from koopman_ros.panel.model_card import model_changes, status_card, training_card, training_ranges
+from koopman_ros.panel.model_card import (
+    brief,
+    model_changes,
+    status_card,
+    training_card,
+    training_ranges,
+)
 from koopman_ros.panel.report_cards import comparison_card, report_card
 from koopman_ros.panel.requests import Action, Answer, Role
 from koopman_ros.panel.snapshot import (
@@ -58,7 +64,7 @@ class _Figures:
 
     def show(self, found: Mapping[str, str]) -> None:
         """Show figures, without the unknown ones."""
-        values = {key: _brief(value) for key, value in found.items() if value not in ('none', '')}
+        values = {key: brief(value) for key, value in found.items() if value not in ('none', '')}
         if list(values) != list(self._shown):
             self._lines.clear()
             self._shown = {}
@@ -69,13 +75,6 @@ class _Figures:
                         self._shown[key] = label('div', '')
         for key, value in values.items():
             self._shown[key].set_text(value)
-
-
-def _brief(value: str) -> str:
-    try:
-        return f'{float(value):.4g}' if '.' in value else value
-    except ValueError:
-        return value
 
 
 class _Task:
@@ -169,24 +168,25 @@ def _model(page: PageLayout) -> None:
     page.follow(show)
 
 
-def _buttons(page: PageLayout, actions: Mapping[str, Callable[[], Awaitable[Answer | None]]]
-             ) -> list[ui.button]:
-    """Add buttons for actions, and the line of their answers; return the buttons."""
+def _buttons(page: PageLayout, task: str,
+             actions: Mapping[str, Callable[[], Awaitable[Answer | None]]]) -> list[ui.button]:
+    """Add buttons for actions on a task, and the line of their answers; return the buttons."""
     async def press(act: Callable[[], Awaitable[Answer | None]]) -> None:
         if found := await act():
             answer.show(found)
 
     with box('row1'):
         buttons = [page.button(text, partial(press, act)) for text, act in actions.items()]
-    answer = AnswerLine(page)
+    answer = AnswerLine(page, lambda now: now.status(task).message)
     return buttons
 
 
 def _recording(page: PageLayout) -> None:
     with page.card('recording', 'Recording', TRAINER):
         task = _Task()
-        record, stop = _buttons(page, {'Record': partial(page.act, 'record', TRAINER, True),
-                                       'Stop': partial(page.act, 'record', TRAINER, False)})
+        record, stop = _buttons(page, RECORDING, {
+            'Record': partial(page.act, 'record', TRAINER, True),
+            'Stop': partial(page.act, 'record', TRAINER, False)})
 
     def show(now: Snapshot) -> None:
         found = now.status(RECORDING)
@@ -209,8 +209,8 @@ def _experiment(page: PageLayout) -> None:
                 'Start the experiment?', 'Start the experiment',
                 ['The experiment applies random steps within these limits:', *lines]) else None
 
-        begin, end = _buttons(page, {'Start …': start,
-                                 'End': partial(page.act, 'experiment', TRAINER, False)})
+        begin, end = _buttons(page, EXPERIMENT, {
+            'Start …': start, 'End': partial(page.act, 'experiment', TRAINER, False)})
 
     def show(now: Snapshot) -> None:
         found = now.status(EXPERIMENT)
@@ -292,8 +292,9 @@ def _training(page: PageLayout) -> None:
             'aria-label="Progress of the training" color=grey-8')
         share = label('div', '', 'value')
         task = _Task(columns=True)
-        train, cancel = _buttons(page, {'Train': partial(page.act, 'train', TRAINER),
-                                        'Cancel': partial(page.act, 'cancel', TRAINER)})
+        train, cancel = _buttons(page, TRAINING, {
+            'Train': partial(page.act, 'train', TRAINER),
+            'Cancel': partial(page.act, 'cancel', TRAINER)})
 
     def show(now: Snapshot) -> None:
         found = now.status(TRAINING)

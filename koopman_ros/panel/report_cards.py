@@ -28,7 +28,8 @@ from koopman_ros.panel.training_report import Findings, ReplayComparison, Traini
 def _findings(address: str, about: str) -> Callable[[Findings], None]:
     """Add lines, picture and text of a report; return the function that shows them."""
     lines = label('div', '', 'lines')
-    picture = attribute(ui.element('img').classes('picture hidden'), 'alt', about)
+    with box('pictures'):
+        picture = attribute(ui.element('img').classes('picture hidden'), 'alt', about)
     with ui.expansion('the whole report').classes('hidden').props('dense') as whole:
         text = label('div', '', 'report')
 

@@ -231,25 +231,24 @@ def _lines(pens: Sequence[_Pen], faces: Mapping[str, Faceplate], marks: Sequence
     spans = [faces[own.signal].span for own in pens]
     height = max(high for _, high in spans) - min(low for low, _ in spans)
     # the chart fails at an end that is not finite
-    ends = sorted((end, f'{own.label} {name}') for own in pens
+    ends = sorted((end, own.label, name) for own in pens
                   if own.kind in ('measured', 'commands')
                   for name, bounds in (('trained', faces[own.signal].training),
                                        ('limit', faces[own.signal].limits))
                   for end in bounds or () if math.isfinite(end))
     found: list[dict[str, Any]] = []
-    labelled: dict[str, Any] = {'yAxis': -math.inf, 'name': ''}
-    for end, name in ends:
+    labels: dict[str, dict[str, None]] = {}  # of the signals, by name of the limit
+    labelled: dict[str, Any] = {'yAxis': -math.inf}
+    for end, label, name in ends:
+        found.append({'yAxis': end, 'name': ''})
         # labels of lines that are near would cover each other: they have one
         if end - labelled['yAxis'] >= _NEAR * height:
-            labelled = {'yAxis': end, 'name': name}
-            found.append(labelled)
-            continue
-        if name not in labelled['name'].split(', '):
-            labelled['name'] += f', {name}'
-        found.append({'yAxis': end, 'name': ''})
+            labelled, labels = found[-1], {}
+        labels.setdefault(name, {})[label] = None
+        labelled['name'] = '; '.join(f'{", ".join(of)} {what}' for what, of in labels.items())
     return found + [{
         'xAxis': 1e3 * mark.time, 'name': mark.label, 'text': mark.text.replace('; ', '\n'),
-        'symbol': 'circle',
+        'symbol': 'circle', 'label': {'position': 'insideEndTop'},
         'lineStyle': {'type': 'solid', 'color': _ABNORMAL if mark.alarm else _QUIET}}
         for mark in marks]
 
@@ -295,8 +294,9 @@ def _options(charts: _Charts, height: int, zoom: bool) -> dict[str, Any]:
     order = [list(dict.fromkeys(own.signal for own in own_pens)) for _, own_pens in charts]
     marked = {'symbol': 'none', 'symbolSize': 8, 'animation': False,
               'lineStyle': {'type': 'dashed', 'color': '#8a8a86'},
-              'label': {'formatter': '{b}', 'position': 'insideEndTop', 'fontSize': 10,
-                        'color': '#4d4d4a'},
+              # at the other end than the newest events
+              'label': {'formatter': '{b}', 'position': 'insideStartTop', 'fontSize': 10,
+                        'color': '#4d4d4a', 'backgroundColor': 'rgba(217,217,214,.75)'},
               'emphasis': {'label': {':formatter': 'p => p.data.text || p.name', 'rotate': 0,
                                      'fontSize': 12, 'color': '#1d1d1b', 'padding': 4,
                                      'backgroundColor': '#f4f4f2'}}}
@@ -321,7 +321,8 @@ def _options(charts: _Charts, height: int, zoom: bool) -> dict[str, Any]:
                     # the unit is at the axis
                     ':formatter': "name => name.split(' [')[0]",
                     'textStyle': {'color': '#1d1d1b', 'fontSize': 13},
-                    'itemHeight': 12, 'itemWidth': 34}
+                    # a symbol would hide the gap of the dashes
+                    'itemStyle': {'opacity': 0}, 'itemHeight': 12, 'itemWidth': 34}
                    for _, own_pens in charts],
         # all charts have the same width, also below a long name
         'grid': [{'left': 56, 'right': 16, 'height': height - _HEAD - _FOOT,
@@ -331,7 +332,7 @@ def _options(charts: _Charts, height: int, zoom: bool) -> dict[str, Any]:
                    'axisPointer': {'label': {':formatter': f'p => ({_CLOCK})(p.value)'}},
                    'axisLabel': {':formatter': _CLOCK, 'hideOverlap': True, 'color': '#1d1d1b'}}
             for at in several],
-        'yAxis': [{'type': 'value', 'scale': True, 'gridIndex': at,
+        'yAxis': [{'type': 'value', 'scale': True, 'gridIndex': at, 'boundaryGap': ['4%', '4%'],
                    'name': f'{", ".join(dict.fromkeys(own.label for own in own_pens))} [{unit}]',
                    'axisLabel': {'color': '#1d1d1b', 'hideOverlap': True},
                    'nameTextStyle': {'color': '#1d1d1b', 'align': 'left'},

@@ -164,6 +164,7 @@ def test_only_the_operator_clears_a_latched_safe_input():
 def test_reasons_name_the_awaited_condition():
     recovering = walk([BEST, LINEAR, *[BEST] * 12])
     assert say(recovering[5].reason).startswith(f'{say(FAR)}: this has ended')
+    assert say(recovering[5].reason).endswith(' 10 s')
     assert recovering[-1].reason is None
     assert say(walk([HOLD] * 62)[-1].reason) == f'{say(NO_LAW)}; held for longer than 60 s'
     # under the safe input for another reason, a hold is not said to last longer than it does

@@ -155,7 +155,6 @@ def test_a_model_is_described_in_words() -> None:
     said = 'On 30 plants'
     model = replace(model, provenance=replace(model.provenance, closed_loops=said))
     assert model_card(model)['Closed loops'] == said
-    assert training_card({'closed_loop_statement': said}) == {'Closed loops': said}
     assert training_ranges(model)['level_1'] == (model.states.lower[0], model.states.upper[0])
     assert training_card({
         'accepted': 'False', 'done [%]': '100', 'heldout_rw': '1e-4', 'units: level_1': 'm',

@@ -15,10 +15,12 @@ from playwright.sync_api import BrowserContext, expect, Locator, Page, WebSocket
 import pytest
 
 from koopman_ros.core.paths import model_path
-from koopman_ros.panel.requests import Action
+from koopman_ros.panel import conditions
+from koopman_ros.panel.history import HistoryFile
+from koopman_ros.panel.requests import Action, Answer, UNKNOWN
 from koopman_ros.panel.snapshot import CONTROLLER, ERROR, OK, PLANT, WARN
 from koopman_ros.parameters.panel import ProcessLimits
-from support.browser import Pages, PATIENCE
+from support.browser import Pages, PATIENCE, repeat_until
 from support.operated import OperatedLoop
 from support.users import PASSWORDS
 
@@ -184,7 +186,7 @@ def test_each_event_has_its_own_time_values_and_person(desk: Desk) -> None:
         expect(events).to_contain_text('set-point: temperature 46 → 46.5 °C by olga')
         page.goto(f'{desk.url}/audit')
         actions = page.get_by_role('list', name='Actions')
-        expect(actions).to_contain_text('otto: setpoint temperature 46')
+        expect(actions).to_contain_text('otto: set-point temperature 46: accepted')
         with page.expect_download() as download:
             page.get_by_role('button', name='Export CSV').click()
         rows = list(csv.DictReader(Path(download.value.path()).read_text().splitlines()))
@@ -203,7 +205,7 @@ def test_another_fault_of_one_status_is_another_alarm(desk: Desk) -> None:
     with desk.page('/alarms') as (loop, page):
         loop.status('pump: bearing', WARN, 'bearing at 81 degC')
         warm = alarm(page, 'bearing at')
-        warm.get_by_role('button', name='Acknowledge').click()
+        warm.get_by_role('button', name='Acknowledge: pump: bearing at 81 °C').click()
         expect(warm).to_contain_text('acknowledged by anna')
         loop.status('pump: bearing', WARN, 'bearing at 82 degC')
         expect(alarm(page, '82 °C')).to_contain_text('acknowledged by anna')
@@ -270,7 +272,7 @@ def test_models_are_compared_on_the_same_data_with_what_their_ranges_gain_and_lo
     loop = OperatedLoop()
     new = str(model_path('reactor_nz4'))
     figures = {'accepted': 'True', 'model_file': new, 'units: temperature': 'K',
-               'heldout_error: temperature': '0.41'}
+               'heldout_error: temperature': '0.410000038'}
     loop.status('trainer: training', OK, 'done', {
         **figures, 'heldout_error_of_current_model: temperature': '1.7'})
     with desk.page('/model', loop) as (_, page):
@@ -278,7 +280,7 @@ def test_models_are_compared_on_the_same_data_with_what_their_ranges_gain_and_lo
         activate.click()
         dialog = page.get_by_role('dialog')
         expect(dialog).to_contain_text('Error on the new record, temperature [K]')
-        expect(dialog.locator('.changes')).to_contain_text(re.compile(r'1\.7\s*0\.41'))
+        expect(dialog.locator('.changes')).to_contain_text(re.compile(r'1\.7\s*0\.41$'))
         expect(dialog).to_contain_text('lost by the new model')
         assert 'Held-out' not in dialog.inner_text()
         page.keyboard.press('Escape')
@@ -373,11 +375,14 @@ def test_bad_quality_is_shown_at_each_value(desk: Desk) -> None:
         expect(coolant.locator('.abnormal')).to_contain_text('held')
         loop.level = 'sdre'
         expect(coolant.locator('.abnormal')).to_be_hidden()
+        loop.control['dead time [s]'] = '45'
+        expect(coolant).to_contain_text('dead time 45 s')
         for role, shown in ((PLANT, coolant.locator('.value')),
                             (CONTROLLER, temperature.locator('.value'))):
             loop.silent.add(role)
             expect(shown).to_have_class(re.compile(r'\bold\b'))
             expect(shown).to_have_text(re.compile(r'^\? '))
+            expect(temperature).to_contain_text('? model prediction 47')
             expect(temperature.get_by_role('button', name='Set')).to_be_disabled()
             expect(asked(page)).to_be_disabled()
             loop.silent.remove(role)
@@ -430,6 +435,90 @@ def test_alarms_are_filtered_sorted_selected_and_grouped_under_their_cause(desk:
         page.get_by_role('option', name='oldest first').click()
         expect(rows.first).to_contain_text('first-out')
         expect(rows.first).to_contain_text('9 s old')
+
+
+def test_alarms_of_a_vanished_node_are_stale_and_then_return(
+        desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(conditions, '_STALE', 1.0)
+    monkeypatch.setattr(conditions, '_GONE', 4.0)
+    with desk.page('/alarms') as (loop, page):
+        loop.status('pump: motor', ERROR, 'tripped')
+        tripped = alarm(page, 'tripped')
+        expect(tripped).to_contain_text(', unacknowledged')
+        assert 'stale' not in tripped.inner_text()
+        loop.forget('pump: motor')
+        expect(tripped).to_contain_text('stale: its node is silent')
+        expect(tripped).to_contain_text('returned, not acknowledged')
+
+
+def test_an_answer_that_does_not_come_is_unknown(desk: Desk) -> None:
+    with desk.page() as (loop, page):
+        ready(page)
+        loop.answer = Answer(False, f'{UNKNOWN}the controller did not answer within 3 s')
+        asked(page).fill('46')
+        asked(page).press('Enter')
+        expect(face(page, 'temperature').locator('.answer')).to_have_text(
+            '✖ unknown: the controller did not answer within 3 s')
+        page.goto(f'{desk.url}/audit')
+        expect(page.get_by_role('list', name='Actions')).to_contain_text('46: ✖ unknown')
+
+
+# Of each chart the names, dashes and values of its pens, and the dashes in its legend.
+CHARTS = """() => {
+    const chart = document.querySelector('.nicegui-echart');
+    const { legend, series } = getElement(parseInt(chart.id.slice(1))).chart.getOption();
+    return legend.map((one, at) => ({
+        symbols: one.itemStyle.opacity,
+        pens: series.filter(own => own.xAxisIndex === at).map(own => ({
+            name: own.name, line: JSON.stringify(own.lineStyle.type),
+            values: own.data.map(point => point[1]) }))}));
+}"""
+
+
+def test_trends_have_gaps_outlast_the_panel_and_say_what_is_not_live(
+        desk: Desk, tmp_path: Path) -> None:
+    loops = [OperatedLoop() for _ in range(2)]
+    now, trends = time.time(), loops[0].view.trends
+    pens = ('temperature', 'temperature set-point', 'temperature predicted', 'coolant command',
+            'coolant applied')
+    for pen in pens:
+        for k in range(10):
+            trends.add(pen, now - 100.0 + k, 33.0)
+    loops[0].request(Action('otto', 'setpoint', 'temperature', 46.0))
+    # a panel, and the one after it
+    for loop in loops:
+        HistoryFile(loop.view, tmp_path / 'history.npz', now)
+    with desk.page('/trends', loops[1]) as (loop, page):
+        expect(page.locator('canvas')).to_be_visible()
+
+        def drawn() -> dict[str, list[float | None]]:
+            return {pen['name'].rpartition(' [')[0]: pen['values']
+                    for chart in page.evaluate(CHARTS) for pen in chart['pens']}
+
+        repeat_until(lambda: all(drawn()[pen][-1:] == [latest] for pen, latest in (
+            ('temperature', 47.0), ('coolant command', 20.0))),
+            lambda: page.wait_for_timeout(100.0))
+        for pen in pens:
+            values = drawn()[pen]
+            gap = values.index(None)
+            assert set(values[:gap]) == {33.0}
+            assert values[gap + 1] not in (None, 33.0)
+        for chart in page.evaluate(CHARTS):
+            lines = [pen['line'] for pen in chart['pens'] if 'planned' not in pen['name']]
+            assert len(set(lines)) == len(lines) > 1
+            # a symbol would hide them in the legend
+            assert chart['symbols'] == 0
+        past = page.get_by_text('NOT LIVE')
+        expect(past).to_be_hidden()
+        box = page.locator('canvas').bounding_box()
+        assert box is not None
+        page.mouse.move(box['x'] + 400.0, box['y'] + 150.0)
+        page.mouse.wheel(0.0, -300.0)
+        expect(past).to_be_visible()
+        page.get_by_role('button', name='Now').click()
+        expect(past).to_be_hidden()
+        page.goto(f'{desk.url}/audit')
+        expect(page.get_by_role('list', name='Actions')).to_contain_text('otto: set-point')
 
 
 def test_what_a_person_types_stays_while_the_panel_sends_a_new_set_point(desk: Desk) -> None:

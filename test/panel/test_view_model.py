@@ -783,7 +783,7 @@ def test_limits_that_are_near_in_a_chart_have_one_label_and_pens_differ_without_
     pens = _charts(now)[0][1]
     lines = _lines(pens, {face.name: face for face in now.states}, [])
     assert [(one['yAxis'], one['name']) for one in lines] == [
-        (0.1, 'level 1 trained, level 2 trained'), (0.102, ''),
-        (1.0, 'level 1 trained, level 2 trained'), (1.0, '')]
+        (0.1, 'level 1, level 2 trained'), (0.102, ''), (1.0, 'level 1, level 2 trained'),
+        (1.0, '')]
     # no two measurements of a chart have the same dashes
     assert len({str(line('measured', place)) for place in range(5)}) == 5

@@ -31,12 +31,14 @@ class OperatedLoop:
 
     :ivar silent: roles that send nothing.
     :ivar asked: actions that reached the loop.
+    :ivar answer: to each of them.
     """
 
     def __init__(self, title: str = 'reactor') -> None:
         self.title, self.learning = title, Learning()
         self.silent: set[str] = set()
         self.asked: list[Action] = []
+        self.answer = Answer(True, 'accepted')
         self.measured, self.applied, self.command = 47.0, 20.0, 20.0
         self.level = 'sdre'
         self.control: dict[str, str] = {'mode': 'automatic', 'model': 'old'}
@@ -101,11 +103,11 @@ class OperatedLoop:
             return view.snapshot(now)
 
     def request(self, action: Action) -> Future[Answer]:
-        """Accept what an operator asks for."""
-        answer = Answer(True, 'accepted')
+        """Answer what an operator asks for."""
+        answer = self.answer
         with self._lock:
             self.asked.append(action)
-            if action.what == 'setpoint':
+            if action.what == 'setpoint' and answer.accepted:
                 self._setpoint = float(action.value)
                 self._record('setpoint', action.who, value=[self._setpoint], accepted=True,
                              reason=[])
