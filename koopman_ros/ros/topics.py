@@ -131,8 +131,8 @@ class EndpointMonitor:
 
     :param on_change: called when the complaint is another.
     :param exclusive: the verb phrase for topics on which only one node may publish.
-    :ivar sources: the numbers of the messages on those that the node receives. By them, a second
-        publisher of the same name that sends is told from one that has died.
+    :ivar sources: numbers of the messages on those of these topics that the node receives. Of two
+        publishers of one name, one may have died: they conflict if these numbers alternate.
     """
 
     def __init__(self, node: HostedNode, on_change: Callable[[], None],
