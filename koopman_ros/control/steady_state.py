@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from koopman_ros.control.laws.base import Target
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.steady_state import Goal, SteadyStateSettings
+from koopman_ros.estimation.base import LOST
 from koopman_ros.model import LiftedModel
 from koopman_ros.model.steady_state import model_steady_state
 
@@ -26,21 +27,23 @@ def steady_state_target(model: LiftedModel, setpoint: Array, w: Array | None = N
     """
     Find the steady state nearest to a set-point under a disturbance; all in scaled deviations.
 
-    Of several that are as near it is the one nearest to the nominal point. Where the inputs would
-    have to leave their range it is the nearest that inputs within the range hold. If there is none
-    within a width of the training box, or only one input, the target keeps an input out of range:
-    saturated, the law comes as near as it can.
+    Its states are no further out than those of a prediction. Of several that are as near it is the
+    one nearest to the nominal point. Where the inputs would have to leave their range it is the
+    nearest that inputs within the range hold. If there is none, or only one input, the target
+    keeps an input out of range: saturated, the law comes as near as it can.
 
     :param setpoint: (n_c,).
     :param w: (n_x,) disturbance of the state's rate, none by default.
     :param controlled: (n_c,) indices of the states with a set-point, all by default.
     :param limits: lower and upper ends (n_u,) of the inputs, none by default.
-    :param start: (n_x + n_u,) state and input to begin from, the nominal point by default.
+    :param start: (n_x + n_u,) state and input, the nominal point by default. The search begins
+        with the set-point in place of its states and, where that fails within the limits, there.
     :return: None where no steady state was found.
     """
     n, n_u, target = model.n_x, model.n_u, None
     w = np.zeros(n) if w is None else w
-    y = np.zeros(n + n_u) if start is None else start.copy()
+    start = np.zeros(n + n_u) if start is None else start
+    y = start.copy()
     if controlled is None or len(controlled) == n:
         # linear in the input, which is all that is left to find
         controlled, f = np.arange(n), model.drift(setpoint)
@@ -49,20 +52,19 @@ def steady_state_target(model: LiftedModel, setpoint: Array, w: Array | None = N
         residual = math.hypot(*(f + forcing).tolist())
         if residual <= _TOLERANCE:
             target = Target(setpoint, u, forcing, residual)
-            if limits is None or n_u == 1:
+            if limits is None or n_u == 1 or ((limits[0] <= u) & (u <= limits[1])).all():
                 return target
     y[controlled] = setpoint
-    endless, goal = np.full(n + n_u, np.inf), Goal(controlled, setpoint)
-    found = model_steady_state(model, w, y, -endless, endless, goal) if target is None else y
-    if found is None:
-        return None
-    if limits is not None and n_u > 1 and ((found[n:] < limits[0] - _TOLERANCE)
-                                           | (found[n:] > limits[1] + _TOLERANCE)).any():
-        within = model_steady_state(
-            model, w, found, np.concatenate((-endless[:n], limits[0])),
-            np.concatenate((endless[:n], limits[1])), goal)
-        # further off it is on another branch
-        if within is not None and (
-                np.abs(within - found)[:n] <= 2.0 * model.states.half_widths + _TOLERANCE).all():
-            return Target.at(model, within, w)
-    return Target.at(model, found, w) if target is None else target
+    goal, ends = Goal(controlled, setpoint), np.outer((-LOST, LOST), model.states.half_widths)
+    if limits is not None and n_u > 1:
+        lower, upper = np.concatenate((ends, limits), axis=1)
+        for place in (y, start):
+            found = model_steady_state(model, w, place, lower, upper, goal)
+            if found is not None:
+                return Target.at(model, found, w)
+    if target is None:
+        endless = np.full(n_u, np.inf)
+        found = model_steady_state(model, w, y, np.concatenate((ends[0], -endless)),
+                                   np.concatenate((ends[1], endless)), goal)
+        target = None if found is None else Target.at(model, found, w)
+    return target

@@ -28,6 +28,7 @@ from koopman_ros.core.integration import STEPS
 from koopman_ros.core.status import StatusCode
 from koopman_ros.core.steady_state import SteadyStateSettings
 from koopman_ros.estimation import DisturbanceObserver, ExtendedKalmanFilter, MeasuredState
+from koopman_ros.estimation.base import LOST
 from koopman_ros.model import NetworkObservables, PolynomialObservables
 from koopman_ros.model.lifted_model import NODES, WEIGHTS
 
@@ -143,7 +144,7 @@ def _uses(controller: Controller, tables: Mapping[str, Any]) -> dict[str, bool]:
         'BUMPLESS': controller.tuning.bumpless_transfer_time > 0.0,
         **{name: bool(tables[name]) for name in (
             'NETWORK', 'READ_OUT', 'N_PHI', 'N_TRAINING', 'N_LOOPS', 'N_TERMS', 'ND', 'KALMAN',
-            'DETERMINED', 'CONTROLS_ALL', 'RESTS')}}
+            'DETERMINED', 'CONTROLS_ALL', 'RESTS', 'LIMITED_TARGET')}}
 
 
 def template(name: str) -> str:
@@ -256,6 +257,7 @@ def _tables(controller: Controller, interval: float) -> dict[str, Any]:
         'ORDER': max(order, n, m), 'MAX_INVERTED': max((n + m) ** 2, n * model.n_z),
         'NETWORK': network, 'READ_OUT': model.readout is not None, 'CLOSED': closed(model),
         'KALMAN': kalman, 'DETERMINED': outputs.determine_state, 'CONTROLS_ALL': best.controls_all,
+        'LIMITED_TARGET': model.n_u > 1, 'LOST': LOST,
         'RESTS': np.count_nonzero(np.any(outputs.C != 0.0, axis=0)) == n_y, 'TIME_UNIT': unit,
         'FASTEST_RATE': linear.fastest_rate / unit,
         'STEP_LENGTH': STEPS.time_constants, 'STEP_MOST': float(STEPS.most),
@@ -269,7 +271,7 @@ def _tables(controller: Controller, interval: float) -> dict[str, Any]:
             'FIRST_COVARIANCE': estimator.initial_covariance,
             'FARTHEST': np.sqrt(estimator._lost)} if kalman else
            {**dict.fromkeys(('H_OUTPUT', 'NOISE', 'INTENSITY', 'FIRST_COVARIANCE'), none),
-            'ONTO_DISTURBANCES': np.eye(n), 'FARTHEST': 10.0 * model.states.half_widths}),
+            'ONTO_DISTURBANCES': np.eye(n), 'FARTHEST': LOST * model.states.half_widths}),
         **{f'STEADY_{name}'.upper(): value
            for name, value in asdict(SteadyStateSettings()).items()},
         'HALF_WIDTH': model.states.half_widths, 'CORNERS': model.states.corners,

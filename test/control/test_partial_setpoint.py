@@ -501,10 +501,22 @@ def test_inputs_that_suffice_exactly_hold_the_setpoint(seed):
     rng = np.random.default_rng(seed)
     upper = rng.uniform(0.2, 1.0, 2)
     # the first pump does more for each L/s, and would go beyond its range
-    gain = np.array([rng.uniform(2.0, 3.0), rng.uniform(0.2, 0.4)])
+    gain = np.array([rng.uniform(0.2, 0.3), rng.uniform(0.02, 0.04)])
     model = tanks([[-1.0]], [gain])
     found = steady_state_target(model, np.array([model.B[0] @ upper]), limits=(-upper, upper))
     assert found.u == pytest.approx(upper, abs=1e-8)
+
+
+def test_no_state_of_a_target_is_further_off_than_that_of_a_prediction():
+    def target(outflow):
+        w = np.array([0.0, -outflow]) / SERIES.states.scale
+        found = steady_state_target(SERIES, np.array([1.0]), w, controlled=np.array([1]))
+        return None if found is None else SERIES.states.to_physical(found.x)
+
+    # 1.5 m in the second tank would take 11.25 m in the first, which is beyond 10 half-ranges
+    np.testing.assert_allclose(target(2.0), [11.0, 1.0])
+    # from which the second would be at -19 m
+    assert target(4.0) is None
 
 
 def test_of_more_states_than_inputs_behind_a_lag_the_target_is_a_compromise():

@@ -1332,21 +1332,27 @@ static int steady_state(int linear, const double *w, const double *lower, const 
 }
 
 /* Find the target y = (x_ref, u_ref) of a set-point (NC), in its units: the steady state nearest
- * to it under a disturbance, with inputs within their range where there is one near; the search
- * begins from y. Returns 0 where there is none.
+ * to it under a disturbance, with inputs within their range where one is found. The search begins
+ * at the set-point and, where that fails, from y. Returns 0 where there is none.
  * Python: control.steady_state.steady_state_target */
 static int find_target(int linear, const double *setpoint, const double *w, double *y)
 {
-    double none[NXU], goal[NXU], lower[NXU], upper[NXU], found[NXU];
-    int inside = 1, known;
+    double none[NXU], goal[NXU], lower[NXU], upper[NXU];
+#if LIMITED_TARGET
+    double before[NXU];
+    int in_range;
+    copy(NXU, y, before);
+#endif
     set_all(NXU, 0.0, none);
     set_all(NXU, (double)NAN, goal);
-    set_all(NXU, -ENDLESS, lower);
-    set_all(NXU, ENDLESS, upper);
     for (int i = 0; i < NC; i++) {
         int k = CONTROLLED[i];
         y[k] = (setpoint[i] - STATES_CENTER[k]) / STATES_SCALE[k];
         goal[k] = y[k];
+    }
+    for (int i = 0; i < NX; i++) {
+        lower[i] = -LOST * HALF_WIDTH[i];
+        upper[i] = LOST * HALF_WIDTH[i];
     }
 #if CONTROLS_ALL
     /* linear in the input, which is all that is left to find: u = -B^+ (f + w) */
@@ -1357,35 +1363,34 @@ static int find_target(int linear, const double *setpoint, const double *w, doub
     pseudo_inverse(NX, NU, B, ROUNDING * norm(NX * NU, B), inverse);
     add_product(NU, NX, 1, -1.0, inverse, rate, y + NX);
     state_rate(linear, y, w, rate, NULL);
-    known = norm(NX, rate) <= STEADY_TOLERANCE
-        || steady_state(linear, w, lower, upper, goal, none, y);
+    const int at_rest = norm(NX, rate) <= STEADY_TOLERANCE;
 #else
-    known = steady_state(linear, w, lower, upper, goal, none, y);
+    const int at_rest = 0;
 #endif
-    if (!known) {
-        return 0;
-    }
+#if LIMITED_TARGET
+    in_range = at_rest;
     for (int i = 0; i < NU; i++) {
         double u = y[NX + i];
         lower[NX + i] = LOWER_V[i];
         upper[NX + i] = UPPER_V[i];
-        inside = inside && u >= LOWER_V[i] - STEADY_TOLERANCE
-            && u <= UPPER_V[i] + STEADY_TOLERANCE;
+        in_range = in_range && u >= LOWER_V[i] && u <= UPPER_V[i];
     }
-    if (NU == 1 || inside) {
-        return 1;
-    }
-    copy(NXU, y, found);
-    if (!steady_state(linear, w, lower, upper, goal, none, found)) {
-        return 1;
-    }
-    for (int i = 0; i < NX; i++) {
-        if (!(fabs(found[i] - y[i]) <= 2.0 * HALF_WIDTH[i] + STEADY_TOLERANCE)) {
-            return 1;                   /* further off it is on another branch */
+    if (!in_range) {
+        double held[NXU];
+        copy(NXU, y, held);
+        if (steady_state(linear, w, lower, upper, goal, none, held)) {
+            copy(NXU, held, y);
+            return 1;
+        }
+        if (steady_state(linear, w, lower, upper, goal, none, before)) {
+            copy(NXU, before, y);
+            return 1;
         }
     }
-    copy(NXU, found, y);
-    return 1;
+#endif
+    set_all(NU, -ENDLESS, lower + NX);
+    set_all(NU, ENDLESS, upper + NX);
+    return at_rest || steady_state(linear, w, lower, upper, goal, none, y);
 }
 
 /* --- Estimation of x and w --- */
