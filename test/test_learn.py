@@ -17,6 +17,7 @@ import pytest
 
 from koopman_ros import learn_files as learn
 from koopman_ros.model import load
+from support.pictures import drawn_figures, title
 from support.quick_retraining import quick_retraining
 
 N, PERIOD = 400, 0.5
@@ -48,15 +49,39 @@ def learned(*arguments, given=('day.csv', '--states', 'level', '--inputs', 'pump
 
 
 @pytest.fixture(scope='module')
-def day(tmp_path_factory):
-    """Learn from a record with a late pump, test on another; return folder and output."""
+def drawn_day(tmp_path_factory):
+    """Learn from a record with a late pump, test on another; return folder, output, figures."""
     folder = tmp_path_factory.mktemp('day')
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as printed:
+    with (pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as printed,
+          drawn_figures() as figures):
         patch.chdir(folder)
         for seed, name in enumerate(('day.csv', 'other.csv')):
             table(seed, late=6).to_csv(name, index=False)
         assert learned('--test', 'other.csv') == 0
-    return folder, printed.getvalue()
+    return folder, printed.getvalue(), figures
+
+
+@pytest.fixture(scope='module')
+def day(drawn_day):
+    """Return folder and output alone."""
+    return drawn_day[:2]
+
+
+def test_pictures_name_their_record_and_show_no_rounding(drawn_day):
+    *_, figures = drawn_day
+    for name, words in (('day.png', 'Training of day from day.csv'),
+                        ('day.free_run.png', 'record day'), ('day.test.png', 'test record other')):
+        assert words in title(figures[name])
+        assert 'accepted' in title(figures[name])
+    # the linear model is the estimate, but for rounding, at a rate of up to 1 m/s
+    difference, prediction, loops, band = figures['day.png'].axes[1:]
+    assert min(np.abs(difference.get_ylim())) > 1e-4
+    assert 'level [m]' in loops.get_xlabel()
+    assert prediction.get_xlabel() == 'time [s]'
+    for axes in (difference, prediction, loops, band):
+        box = axes.get_legend().get_window_extent()
+        assert axes.bbox.fully_containsx(box.x0)
+        assert axes.bbox.fully_containsx(box.x1)
 
 
 def test_a_file_is_learned_tested_and_reported(day):

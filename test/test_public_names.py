@@ -35,6 +35,7 @@ from koopman_ros import (
     Tuning,
 )
 from koopman_ros.core.paths import model_path
+from support.pictures import drawn_figures, title
 from support.quick_retraining import quick_retraining
 
 PERIOD, ROWS, LATE = 0.5, 400, 6
@@ -152,7 +153,9 @@ def test_a_loop_is_run_and_drawn(tanks, tmp_path):
         controller(tanks), Process(plant, 0, plant.nominal_state, plant.nominal_input),
         [at(20.0, SetpointRequest(0, [0.1, 0.15]))], duration=200.0, period=5.0)
     assert run.states[-1] == pytest.approx([0.1, 0.15], abs=1e-3)
-    run.draw(tmp_path / 'loop.png')
+    with drawn_figures() as figures:
+        run.draw(tmp_path / 'loop.png')
+    assert 'level 1 ends' in title(figures['loop.png'])
     assert (tmp_path / 'loop.png').read_bytes().startswith(b'\x89PNG')
 
 

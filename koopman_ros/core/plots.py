@@ -18,10 +18,15 @@ import math
 import os
 from pathlib import Path
 import platform
+import re
 from typing import Any, TYPE_CHECKING
 
+import numpy as np
+
 from koopman_ros import __version__
+from koopman_ros.core.arrays import Array
 from koopman_ros.core.paths import write_atomically
+from koopman_ros.core.units import unit_label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -115,6 +120,26 @@ def drawing(path: Path, rows: int = 1, columns: int = 1, *, size: tuple[float, f
     yield figure, panels
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)
+
+
+def axis_label(name: str, unit: str) -> str:
+    """Return name and unit of a signal for an axis: a state that is not measured has no unit."""
+    words = re.sub(r'^hidden (\d+)$', r'unmeasured state \1', name.replace('_', ' '))
+    return words if unit == '1' else f'{words} [{unit_label(unit)}]'
+
+
+def time_axis(span: float) -> tuple[str, float]:
+    """Return the unit in which a span of time in s is read, and its length in s."""
+    return next((one for one in (('d', 86400.0), ('h', 3600.0)) if span >= 3.0 * one[1]),
+                ('s', 1.0))
+
+
+def zoom(axes: Axes, values: Array) -> None:
+    """Limit the vertical axis to some values and half their range on both sides."""
+    low, high = np.nanmin(values), np.nanmax(values)
+    margin = 0.5 * (high - low) or 1.0
+    below, above = axes.get_ylim()
+    axes.set_ylim(max(below, low - margin), min(above, high + margin))
 
 
 def draw_limits(axes: Axes, bounds: Iterable[float], label: str) -> None:

@@ -19,7 +19,14 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.core.paths import model_path
-from koopman_ros.core.plots import draw_limits, drawing, DRAWN_RANGE, legend, write_figures
+from koopman_ros.core.plots import (
+    axis_label,
+    draw_limits,
+    drawing,
+    DRAWN_RANGE,
+    legend,
+    write_figures,
+)
 from koopman_ros.core.units import conversion, display_unit, printed, shown, unit_label
 from koopman_ros.demo.console import LiveTable, read_options, run_demo
 from koopman_ros.demo.exported import ExportedLoop
@@ -198,7 +205,7 @@ def _draw(path: Path, title: str, run: DemoRun, trajectories: Mapping[str, Optim
                 values = np.clip(np.nan_to_num(shown(trajectory.states[:, i], unit), nan=high),
                                  2.0 * low - high, 2.0 * high - low)
                 panel.plot(times(values), values, label=name, **_STYLES[name])
-            panel.set_ylabel(f'{signal.replace("_", " ")} [{unit_label(unit)}]')
+            panel.set_ylabel(axis_label(signal, unit))
         for j, ((signal, unit), panel) in enumerate(zip(
                 signals.inputs.items(), panels[len(signals.states):], strict=True)):
             low, high = (float(shown(float(end[j]), unit))
@@ -217,7 +224,7 @@ def _draw(path: Path, title: str, run: DemoRun, trajectories: Mapping[str, Optim
                 values = np.clip(np.nan_to_num(shown(trajectory.inputs[:, j], unit), nan=high),
                                  low, high)
                 panel.step(times(values), values, where='post', label=name, **_STYLES[name])
-            panel.set_ylabel(f'{signal.replace("_", " ")} [{unit_label(unit)}]')
+            panel.set_ylabel(axis_label(signal, unit))
         panels[0].set_title(title, fontsize=9)
         panels[-1].set(xlabel='plant time [s]', xlim=(0.0, run.seconds[-1]))
         legend(figure, panels, 6 if code is None else 4)

@@ -11,8 +11,8 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.core.plots import drawing, DRAWN_RANGE, legend
-from koopman_ros.core.units import shown, unit_label
+from koopman_ros.core.plots import axis_label, drawing, DRAWN_RANGE, legend
+from koopman_ros.core.units import shown
 from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest
 
 if TYPE_CHECKING:
@@ -43,16 +43,17 @@ def plot_law_check(check: ClosedLoopTest, path: Path) -> Path:
 def draw_loops(axes: Axes, check: ClosedLoopTest, i: int) -> None:
     """Draw start and set-point of each loop in state i, with its outcome."""
     states, failed = check.states, check.failed
-    name, unit = states.names[i].replace('_', ' '), states.units[i]
+    unit = states.units[i]
+    signal = axis_label(states.names[i], unit)
     low, high = shown(states.lower[i], unit), shown(states.upper[i], unit)
     axes.axvspan(low, high, **DRAWN_RANGE)
     kinds: tuple[tuple[NDArray[np.bool_], str, dict[str, Any]], ...] = (
-        (~check.poor & ~failed, 'reaches the set-point at up to '
+        (~check.poor & ~failed, 'arrives, at most '
          f'{check.settings.most_cost:g} times the cost of a linear law',
          {'color': '0.45', 'marker': '.'}),
-        (check.poor & ~failed, 'does not; a perfect model would not either',
+        (check.poor & ~failed, 'does not, nor with a perfect model',
          {'facecolors': 'none', 'edgecolors': 'tab:blue', 'marker': 'o'}),
-        (failed, 'would cost clearly less, or reach the set-point, with a perfect model',
+        (failed, 'does clearly better with a perfect model',
          {'color': 'tab:red', 'marker': 'x'}))
     for chosen, label, style in kinds:
         if chosen.any():
@@ -61,9 +62,8 @@ def draw_loops(axes: Axes, check: ClosedLoopTest, i: int) -> None:
                          label=f'{label} ({int(chosen.sum())})', **style)
     axes.axline((low, low), (high, high), color='0.6', linestyle='--', linewidth=1.0,
                 label='set-point at the start')
-    axes.set(xlabel=f'start, {name} [{unit_label(unit)}]',
-             ylabel=f'set-point, {name} [{unit_label(unit)}]', xlim=_with_margin(low, high),
-             ylim=_with_margin(low, high))
+    axes.set(xlabel=f'start, {signal}', ylabel=f'set-point, {signal}',
+             xlim=_with_margin(low, high), ylim=_with_margin(low, high))
 
 
 def _with_margin(low: float, high: float) -> tuple[float, float]:

@@ -21,10 +21,10 @@ from koopman_ros.control.laws.base import Target
 from koopman_ros.control.state import State, StepReport
 from koopman_ros.control.steady_state import steady_state_target
 from koopman_ros.core.arrays import Array, expect, frozen, short_repr
-from koopman_ros.core.plots import draw_limits, drawing
+from koopman_ros.core.plots import axis_label, draw_limits, drawing, time_axis
 from koopman_ros.core.signals import per_signal
 from koopman_ros.core.status import reason, StatusFormatter
-from koopman_ros.core.units import Displays, NANOSECONDS, shown, unit_label
+from koopman_ros.core.units import Displays, NANOSECONDS, printed, shown
 from koopman_ros.model import LiftedModel
 
 # what is measured (n,) of a value (n,) at a time in s; NaN for what is not, None for no message
@@ -167,23 +167,37 @@ class LoopRun:
         signals = [*zip(outputs.names, outputs.units, strict=True),
                    *zip(inputs.names, inputs.units, strict=True)]
         with drawing(Path(path), len(signals), size=(8.0, 1.9 * len(signals) + 0.6), sharex=True
-                     ) as (_, panels):
+                     ) as (figure, panels):
+            time_unit, second = time_axis(float(self.times[-1]))
+            times = self.times / second
             for i, (axes, (name, unit)) in enumerate(zip(panels, signals, strict=True)):
                 if i < n_y:
-                    axes.plot(self.times, shown(self.measured[:, i], unit), label='measured')
+                    axes.plot(times, shown(self.measured[:, i], unit), label='measured')
                     if name in controlled:
-                        axes.step(self.times, shown(
+                        axes.step(times, shown(
                             self.setpoints[:, controlled.index(name)], unit), where='post',
                             color='k', linestyle='--', linewidth=1.0, label='set-point')
                 else:
-                    axes.step(self.times, shown(self.commands[:, i - n_y], unit), where='post',
+                    axes.step(times, shown(self.commands[:, i - n_y], unit), where='post',
                               color='tab:green', label='command')
                     draw_limits(axes, (shown(end[i - n_y], unit) for end in (
                         limits.lower, limits.upper)), 'limits')
-                axes.set_ylabel(f'{name.replace("_", " ")} [{unit_label(unit)}]')
+                axes.set_ylabel(axis_label(name, unit))
                 axes.legend(fontsize=8, loc='lower right', bbox_to_anchor=(1.0, 1.0), ncols=2,
                             frameon=False)
-            panels[-1].set_xlabel('time [s]')
+            panels[-1].set_xlabel(f'time [{time_unit}]')
+            figure.suptitle(f'{controller.model.provenance.plant}: {self._outcome()}', fontsize=10)
+
+    def _outcome(self) -> str:
+        """Say how the loop ended."""
+        controller = self.loop.controller
+        outputs, units = controller.measured.names, controller.measured.units
+        errors = [(name, units[i], abs(self.setpoints[-1, j] - self.measured[-1, i]))
+                  for j, name in enumerate(controller.controlled.names)
+                  if name in outputs for i in [outputs.index(name)]]
+        return self.failure or ', '.join(
+            f'{name.replace("_", " ")} ends {error:.2g} {printed(unit)} from its set-point'
+            for name, unit, error in errors if np.isfinite(error)) or 'no set-point'
 
 
 def run_loop(controller: Controller, plant: Plant,

@@ -18,9 +18,9 @@ from scipy.optimize import least_squares, OptimizeResult
 
 from koopman_ros.core.arrays import Array, expect, frozen, short_repr, show_printed
 from koopman_ros.core.datasets import Episode, PlantDescription
-from koopman_ros.core.plots import drawing
+from koopman_ros.core.plots import axis_label, drawing, time_axis, zoom
 from koopman_ros.core.solvers import differences
-from koopman_ros.core.units import SECONDS_PER_TIME_UNIT, shown, unit_label
+from koopman_ros.core.units import SECONDS_PER_TIME_UNIT, shown
 from koopman_ros.learning.identification import Drift, Identified, longest_step, Segments
 from koopman_ros.learning.identification.drift import Rate
 from koopman_ros.learning.lift.metrics import lifted_rate
@@ -101,42 +101,51 @@ class FreeRun:
                 return float(episode.time[np.argmin(near.all(axis=1))])
         return np.nan
 
-    def draw(self, path: str | os.PathLike[str]) -> None:
+    def draw(self, path: str | os.PathLike[str], title: str = '') -> None:
         """
         Draw measurements, simulation and inputs of the first episodes, as PNG.
 
+        A simulation that diverges is cut near the measurements.
+
+        :param title: by default the name of the record's plant.
         :raises ImportError: without matplotlib.
         """
         episodes = self.episodes[:_PICTURED]
         inputs, n_y = self.plant.input_names, len(self.names)
         rows, columns = n_y + len(inputs), len(episodes)
+        seconds = SECONDS_PER_TIME_UNIT[self.plant.time_unit]
+        time_unit, second = time_axis(seconds * max(
+            one.time[-1] - one.time[0] for one in episodes))
         with drawing(Path(path), rows, columns, size=(7.0 * columns, 2.2 * rows + 0.8),
                      sharex='col') as (figure, panels):
             for k, (episode, simulated) in enumerate(zip(episodes, self.paths, strict=False)):
+                times = seconds / second * episode.time
                 for i in range(rows):
                     axes = panels[i * columns + k]
                     if i < n_y:
                         unit = self.units[i]
-                        axes.plot(episode.time, shown(episode.x[:, i], unit), '.', color='0.6',
+                        axes.plot(times, shown(episode.x[:, i], unit), '.', color='0.6',
                                   markersize=3.0, label='measured')
-                        axes.plot(episode.time, shown(simulated[:, i], unit), color='tab:green',
+                        axes.plot(times, shown(simulated[:, i], unit), color='tab:green',
                                   label='free run')
-                        axes.axvspan(episode.time[0], episode.time[
-                            min(self.init, len(episode)) - 1], color='0.93', label='start')
+                        axes.axvspan(times[0], times[min(self.init, len(episode)) - 1],
+                                     color='0.93', label='start')
+                        zoom(axes, shown(episode.x[:, i], unit))
                         name = self.names[i]
                         if not k:
-                            axes.set_title(f'fit {self.fit[i]:.1f} %', loc='left', fontsize=8)
+                            axes.set_title('diverges' if not np.isfinite(self.fit[i]) else
+                                           f'fit {self.fit[i]:.1f} %', loc='left', fontsize=8)
                     else:
                         j = i - n_y
                         name, unit = inputs[j], self.plant.input_units[j]
-                        axes.step(episode.time, shown(
+                        axes.step(times, shown(
                             episode.inputs_at(episode.time)[:, j], unit), where='post',
                             color='tab:blue')
-                    axes.set_ylabel(f'{name.replace("_", " ")} [{unit_label(unit)}]')
+                    axes.set_ylabel(axis_label(name, unit))
                 panels[k].legend(fontsize=8, loc='lower right', bbox_to_anchor=(1.0, 1.0), ncols=3,
                                  frameon=False)
-                panels[(rows - 1) * columns + k].set_xlabel(f'time [{self.plant.time_unit}]')
-            figure.suptitle('Free run')
+                panels[(rows - 1) * columns + k].set_xlabel(f'time [{time_unit}]')
+            figure.suptitle(title or f'Free run of {self.plant.name}', fontsize=10)
 
 
 def simulate(model: AnyModel, record: Record, init: int | None = None, *,

@@ -9,8 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.core.plots import bullets, drawing, table, write_figures, write_page
-from koopman_ros.core.units import SECONDS_PER_TIME_UNIT, shown, unit_label
+from koopman_ros.core.plots import (
+    axis_label,
+    bullets,
+    drawing,
+    table,
+    time_axis,
+    write_figures,
+    write_page,
+    zoom,
+)
+from koopman_ros.core.units import printed, SECONDS_PER_TIME_UNIT, shown
 from koopman_ros.evaluation.closed_loop_plots import draw_loops
 from koopman_ros.learning.acceptance import PlantAcceptance
 from koopman_ros.learning.downsampling import CELLS, visited_cells
@@ -33,8 +42,9 @@ def write_report(retrained: TrainingResult) -> list[Path]:
     drawn = _draw(pictures['Data, drift and prediction'], retrained)
     for name, run in retrained.free_runs.items() if drawn else ():
         path = base.with_suffix('.free_run.png' if name == 'record' else f'.{name}.png')
-        run.draw(path)
-        pictures[f'Free run on the {name}'.replace('test', 'test record')] = path
+        title = f'Free run on the {name} {run.plant.name}'.replace('test', 'test record', 1)
+        run.draw(path, f'{title}: the new model is {_verdict(retrained)}')
+        pictures[title] = path
     written = [write_figures(base.with_suffix('.json'), retrained.summary()),
                write_page(base.with_suffix('.md'), _title(retrained),
                           [*_sections(retrained),
@@ -56,6 +66,10 @@ def reported(retrained: TrainingResult) -> tuple[dict[str, Any], tuple[str, ...]
     return {**retrained.summary(), 'warnings': warnings}, files
 
 
+def _verdict(retrained: TrainingResult) -> str:
+    return 'accepted' if retrained.accepted else 'rejected'
+
+
 def _title(retrained: TrainingResult) -> str:
     """Name the training by its plant and record."""
     kind = 'Training' if retrained.present is None else 'Retraining'
@@ -70,7 +84,7 @@ def _sections(retrained: TrainingResult) -> Iterator[str]:
     errors = tuple(f'error of {name} [{unit}]'
                    for name, unit in zip(states.names, states.units, strict=True))
     kind = '' if learned is None else f' ({learned.model.kind})'
-    yield f'**The new model{kind} is {"accepted" if retrained.accepted else "rejected"}.**'
+    yield f'**The new model{kind} is {_verdict(retrained)}.**'
     yield bullets([*retrained.reasons, *(f'Warning: {one}.' for one in retrained.warnings)])
     if retrained.model_file:
         yield f'Model file: `{retrained.model_file}`'
@@ -182,7 +196,7 @@ def _plant_sections(about: PlantAcceptance, states: Coordinates) -> Iterator[str
 
 
 def _label(signals: Coordinates, k: int) -> str:
-    return f'{signals.names[k].replace("_", " ")} [{unit_label(signals.units[k])}]'
+    return axis_label(signals.names[k], signals.units[k])
 
 
 def _draw(path: Path, retrained: TrainingResult) -> bool:
@@ -205,8 +219,7 @@ def _draw(path: Path, retrained: TrainingResult) -> bool:
                     low, high = row[3].get_ylim()
                     row[3].set_ylim(low, high + 0.2 * (high - low))  # room for the legend
                     row[3].legend(fontsize=8, loc='upper left')
-            word = 'accepted' if retrained.accepted else 'rejected'
-            figure.suptitle(f'{_title(retrained)}: the new model is {word}')
+            figure.suptitle(f'{_title(retrained)}: the new model is {_verdict(retrained)}')
     except ImportError:
         return False
     return True
@@ -254,8 +267,14 @@ def _draw_drift(axes: Any, retrained: TrainingResult, i: int) -> None:
                   color=color, label=name)
     axes.axhline(0.0, color='k', linestyle='--', linewidth=1.0,
                  label='estimated from the data')
+    # differences below a thousandth of the rates are none: rounding would fill the panel
+    low, high = axes.get_ylim()
+    width = box.inputs.upper - box.inputs.lower
+    least = 1e-3 * float(np.ptp(estimated) + np.abs(found.drift.input_matrix[i]) @ width)
+    axes.set_ylim(min(low, -least), max(high, least))
     axes.set(xlabel=_label(box.states, i),
-             ylabel=f'difference of the rate [{box.states.units[i]}/{retrained.plant.time_unit}]',
+             ylabel='difference of the rate '
+                    f'[{printed(box.states.units[i])}/{retrained.plant.time_unit}]',
              title='difference of the rate, the others in the middle')
     axes.legend()
 
@@ -274,7 +293,7 @@ def _draw_band(axes: Any, retrained: TrainingResult, band: RateBand, i: int) -> 
               color='tab:blue', transform=axes.get_xaxis_transform())
     axes.plot([], [], '|', color='tab:blue', label='measurements')
     axes.set(xlabel=_label(states, i),
-             ylabel=f'rate [{states.units[i]}/{retrained.plant.time_unit}]',
+             ylabel=f'rate [{printed(states.units[i])}/{retrained.plant.time_unit}]',
              title='rate where the data are, and its band')
     axes.legend()
 
@@ -286,12 +305,17 @@ def _draw_prediction(axes: Any, retrained: TrainingResult, i: int) -> None:
     segments = Segments.of([episode], longest_step([episode]))
     times = np.concatenate(([0.0], np.cumsum(segments.steps[:, 0])))
     measured = segments.measured[:, 0, min(i, segments.measured.shape[2] - 1)]
-    axes.plot(times[measured], shown(segments.x[measured, 0, i], states.units[i]),
-              '.', color='0.6', markersize=3.0, label='measured')
+    seconds = SECONDS_PER_TIME_UNIT[retrained.plant.time_unit]
+    time_unit, second = time_axis(seconds * times[-1])
+    times = seconds / second * times
+    values = shown(segments.x[measured, 0, i], states.units[i])
+    axes.plot(times[measured], values, '.', color='0.6', markersize=3.0,
+              label='measured' if i < len(states) - found.hidden else 'estimated')
     for name, rate, color in _lifts(retrained):
         x0, _ = fitted_starts(rate, segments, found.drift.box.states.scale)
         path = segments.path(rate, x0)[:, 0, i]
         axes.plot(times, shown(path, states.units[i]), color=color, label=name)
-    axes.set(xlabel=f'time [{retrained.plant.time_unit}]', ylabel=_label(states, i),
+    zoom(axes, values)
+    axes.set(xlabel=f'time [{time_unit}]', ylabel=_label(states, i),
              title='prediction of a held-out segment')
     axes.legend()

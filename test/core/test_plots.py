@@ -23,6 +23,13 @@ def test_figures_hold_null_for_numbers_without_json_form(tmp_path):
     assert [file.name for file in path.parent.iterdir()] == ['summary.json']
 
 
+@pytest.mark.parametrize(('name', 'unit', 'label'), [
+    ('level_1', 'K', 'level 1 [°C]'), ('hidden_2', '1', 'unmeasured state 2'), ('x', '1', 'x'),
+    ('hidden_valve', 'percent', 'hidden valve [%]')])
+def test_an_axis_has_name_and_unit(name, unit, label):
+    assert plots.axis_label(name, unit) == label
+
+
 def test_a_drawing_is_written_when_its_block_ends_without_an_error(tmp_path):
     path = tmp_path / 'new' / 'picture.png'
     with pytest.raises(ZeroDivisionError), plots.drawing(path, size=(2.0, 2.0)):

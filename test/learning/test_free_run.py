@@ -15,6 +15,7 @@ from koopman_ros.learning.pipeline import _failed_runs, DRIFT, LINEAR_MODEL
 from koopman_ros.model import Box, Coordinates, linearised_model, Provenance
 from koopman_ros.records import read
 from support.heater_logs import COLD_DAY, DAYS, write_heater_logs
+from support.pictures import drawn_figures, title
 from support.sampling import sampled
 
 A, B = np.array([[0.0, 1.0], [-1.0, -0.4]]), np.array([[0.0], [1.0]])
@@ -94,12 +95,30 @@ def test_errors_of_a_wrong_model_count_after_the_start(tmp_path):
     assert (tmp_path / 'run.png').read_bytes().startswith(b'\x89PNG')
 
 
-def test_a_diverging_model_is_reported(tmp_path):
+def test_a_diverging_model_is_reported_and_drawn_within_the_data(tmp_path):
     run = simulate(lifted(slope=30.0 * np.eye(2)), read(table(), 'position [m]', 'force [N]'),
                    init=2)
     assert run.diverged
     assert run.rmse[0] == np.inf
-    run.draw(tmp_path / 'run.png')
+    with drawn_figures() as figures:
+        run.draw(tmp_path / 'run.png', 'rejected')
+    position = figures['run.png'].axes[0]
+    (low, high), values = position.get_ylim(), table()['position']
+    assert low <= min(values) < max(values) <= high
+    assert high - low <= 2.01 * np.ptp(values)
+    assert 'diverges' in position.get_title(loc='left')
+    assert title(figures['run.png']) == 'rejected'
+
+
+def test_a_picture_of_days_counts_days(tmp_path):
+    record = read({**table(), 'time': 7200.0 * np.arange(N)}, 'position [m]', 'force [N]',
+                  name='basin')
+    with drawn_figures() as figures:
+        simulate(lifted(slope=1e-5 * A), record, init=2, picture=tmp_path / 'run.png')
+    axes = figures['run.png'].axes[-1]
+    assert axes.get_xlabel() == 'time [d]'
+    assert axes.lines[0].get_xdata()[-1] == pytest.approx(7200.0 * (N - 1) / 86400.0)
+    assert 'basin' in title(figures['run.png'])
 
 
 @pytest.mark.parametrize(('slope', 'diverged', 'words'), [
