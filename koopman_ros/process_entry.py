@@ -14,6 +14,7 @@ import select
 import signal
 import sys
 import threading
+import time
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -25,8 +26,13 @@ _ONE_THREAD_PROGRAMS = ('koopman_ros.learn_files', 'koopman_ros.export.command_l
     f'koopman_ros.nodes.{name}' for name in ('plant', 'controller', 'player', 'replay')))
 
 
-def run_program(module: str, interrupted: int) -> int:
-    """Run the `main` of a module; return its exit code, or `interrupted` after a signal."""
+def run_program(module: str, interrupted: int, patience: float = 0.0) -> int:
+    """
+    Run the `main` of a module; return its exit code, or `interrupted` after a signal.
+
+    :param patience: time in s after which the process ends, whatever it does after a signal; 0: it
+        may take its time.
+    """
     open_standard_streams()
     codes: list[int] = []
     # registered first, so that it is called last
@@ -36,11 +42,15 @@ def run_program(module: str, interrupted: int) -> int:
     if module in _ONE_THREAD_PROGRAMS:
         os.environ.update(ONE_THREAD)
     main = importlib.import_module(module).main
+    if patience:
+        _end_soon_after_signals(patience, interrupted)
     handle_signals(_interrupt)
     try:
         codes.append(main())
     except KeyboardInterrupt:
         codes.append(interrupted)
+        if patience:
+            threading.Event().wait(2.0 * patience)  # for its end, which says so
     finally:
         handle_signals(signal.SIG_IGN)
     return codes[0]
@@ -73,6 +83,23 @@ def _interrupt(*_: object) -> None:
     # a second signal would interrupt the clean end
     handle_signals(signal.SIG_IGN)
     raise KeyboardInterrupt
+
+
+def _end_soon_after_signals(seconds: float, code: int) -> None:
+    """End the process so many s after a signal, also where the main thread does not see it."""
+    # the interpreter writes to it at once, while a library still calculates
+    seen, written = os.pipe()
+    os.set_blocking(written, False)
+    signal.set_wakeup_fd(written)
+
+    def end() -> None:
+        while os.read(seen, 1)[0] not in SIGNALS:
+            pass
+        time.sleep(seconds)
+        print('interrupted; files that were written before are kept', file=sys.stderr, flush=True)
+        os._exit(code)
+
+    threading.Thread(target=end, daemon=True).start()
 
 
 def force_exit_after(seconds: float, code: int = 0, sentence: str = '') -> Callable[[], None]:
@@ -150,7 +177,7 @@ trainer = partial(run_program, 'koopman_ros.nodes.trainer', 0)
 player = partial(run_program, 'koopman_ros.nodes.player', 0)
 replay = partial(run_program, 'koopman_ros.nodes.replay', 130)
 panel = partial(run_program, 'koopman_ros.nodes.panel', 0)
-learn = partial(run_program, 'koopman_ros.learn_files', 130)
+learn = partial(run_program, 'koopman_ros.learn_files', 130, 0.3)
 export_c = partial(run_program, 'koopman_ros.export.command_line', 130)
 command_line = partial(run_program, 'koopman_ros.ros.command_line', 130)
 

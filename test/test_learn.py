@@ -8,6 +8,7 @@ import io
 import json
 import os
 from pathlib import Path
+import signal
 import subprocess
 import sys
 
@@ -230,3 +231,18 @@ def test_the_module_is_the_program(tmp_path):
         cwd=tmp_path, env={**os.environ, 'PYTHONPATH': str(Path(learn.__file__).parents[1])})
     assert found.returncode == 1
     assert found.stderr.startswith('learn: the signals are not known: give --states and --inputs')
+
+
+def test_a_training_ends_by_a_signal(folder):
+    arguments = ['learn', 'day.csv', '--states', 'level', '--inputs', 'pump']
+    with subprocess.Popen([sys.executable, '-m', 'koopman_ros', *arguments],
+                          stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder,
+                          env={**os.environ, 'PYTHONPATH': str(Path(learn.__file__).parents[1])}
+                          ) as process:
+        while '400 of 400 values used' not in process.stdout.readline():
+            assert process.poll() is None
+        process.send_signal(signal.SIGTERM)
+        _, said = process.communicate(timeout=60.0)
+    assert process.returncode == 130
+    assert said.strip().startswith('interrupted')
+    assert [path.name for path in folder.iterdir()] == ['day.csv']

@@ -55,15 +55,25 @@ class TrainingProgress:
 
     def __init__(self, say: Callable[[str], object]) -> None:
         self._say = say
-        self._last_line = time.monotonic()
+        self._begin = self._last_line = time.monotonic()
 
     def show(self, state: JobState) -> None:
         """Show a state of the training."""
+        text = f'{self._left(state.share)}{state.text}'
         if sys.stderr.isatty():
-            show_bar(state.share, *(('', '\n') if state.ended else (state.text,)))
+            show_bar(state.share, *(('', '\n') if state.ended else (text,)))
         elif not state.ended and time.monotonic() - self._last_line > _LINE_PERIOD:
             self._last_line = time.monotonic()
-            self._say(f'{100.0 * state.share:.0f} %: {state.text}')
+            self._say(f'{100.0 * state.share:.0f} %: {text}')
+
+    def _left(self, share: float) -> str:
+        """Return about how long it will still take, by the time that it took so far."""
+        spent = time.monotonic() - self._begin
+        if spent < _LINE_PERIOD or not 0.0 < share < 1.0:
+            return ''
+        seconds = spent * (1.0 - share) / share
+        return (f'about {seconds:.0f} s left, ' if seconds < 90.0 else
+                f'about {seconds / 60.0:.0f} min left, ')
 
 
 class TrainingJob(Job):

@@ -25,11 +25,14 @@ class PipelineProgress:
 
     def __init__(self, on_progress: OnProgress) -> None:
         self._on_progress, self.learned, self._read = on_progress, 0.0, 0
+        self._share = 0.0
 
     def __call__(self, stage: str, share: float, text: str) -> None:
         """Report the share of a stage that is done."""
         begin, end = _STAGES[stage]
-        if self._on_progress(begin + share * (end - begin), text):
+        # a search that is extended has more to do than was counted; what is done remains done
+        self._share = max(self._share, begin + share * (end - begin))
+        if self._on_progress(self._share, text):
             raise Stopped
 
     def reading(self, total: int) -> Callable[[int], None]:

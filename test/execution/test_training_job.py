@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -135,3 +136,16 @@ def test_figures_are_reported_for_each_signal() -> None:
     assert 'infinite (diverges)' in training.outcome_text(summary)
     said = {**summary, 'closed_loop_statement': 'On 30 plants'}
     assert training.outcome_text(said).endswith('written to new. On 30 plants')
+
+
+def test_a_line_of_progress_says_about_how_long_the_rest_takes(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    now, lines = [0.0], list[str]()
+    monkeypatch.setattr(training, 'time', SimpleNamespace(monotonic=lambda: now[0]))
+    progress = training.TrainingProgress(lines.append)
+    for seconds, share in ((2.0, 0.1), (20.0, 0.25), (60.0, 0.2)):
+        now[0] = seconds
+        progress.show(JobState(share, 'learning'))
+    assert len(lines) == 2
+    assert '25 %: about 60 s left, learning' in lines[0]
+    assert 'about 4 min left' in lines[1]

@@ -18,6 +18,7 @@ from koopman_ros.learning.downsampling import coverage, visited_cells
 from koopman_ros.learning.identification import Stopped
 from koopman_ros.learning.identification.alternatives import TransformedDrift
 from koopman_ros.learning.lift.metrics import lifted_rate
+from koopman_ros.learning.pipeline_progress import PipelineProgress
 from koopman_ros.model import load, ModelFileError, save
 from koopman_ros.records import BagReadError
 from support.known_plants import box
@@ -116,6 +117,15 @@ def test_progress_rises_to_the_end(accepted):
     assert {'estimating: drift of degree 3', 'learning: identity lift, n_z 2, start 1 of 1',
             'judging: identity lift'} < set(words)
     assert words[-2:] == ('judging: further closed loops', 'writing')
+
+
+def test_progress_does_not_fall_when_more_has_to_be_done():
+    shares = []
+    progress = PipelineProgress(lambda share, text: bool(shares.append(share)))
+    for done, total in ((1, 4), (2, 4), (2, 12), (7, 12)):
+        progress.estimating(done, total, 'drift')
+    assert shares == sorted(shares)
+    assert shares[1] == shares[2] < shares[3]
 
 
 def test_rejected_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_path):
