@@ -15,6 +15,7 @@ from typing import Any
 
 from koopman_ros import __version__
 from koopman_ros.core.paths import model_path
+from koopman_ros.core.units import printed
 from koopman_ros.execution.training import (
     class_lines,
     constant_lines,
@@ -194,13 +195,13 @@ def _learned(options: Mapping[str, Any], present: LiftedModel | None, record: Re
            if (file := getattr(settings, name))}})
     progress.show(JobState(1.0, ended=True))
     summary, files = reported(result)
-    print(outcome_text(summary))
+    print(printed(outcome_text(summary)))
     for name, line in {**class_lines(summary), **constant_lines(summary)}.items():
-        print(f'{name}: {line}')
+        print(printed(f'{name}: {line}'))
     for warning in summary['warnings']:
-        print(f'warning: {warning}')
+        print(f'warning: {printed(warning)}')
     for name, run in result.free_runs.items():
-        print(f'{name}: {run}')
+        print(printed(f'{name}: {run}'))
     print('report: ' + ', '.join(files))
     print(f'{summary["found"]}: {"accepted" if result.accepted else "rejected"}')
     print(f'next: {_next(summary["model_file"], result.accepted)}')

@@ -86,7 +86,7 @@ def _interrupt(*_: object) -> None:
 
 
 def _end_soon_after_signals(seconds: float, code: int) -> None:
-    """End the process so many s after a signal, also where the main thread does not see it."""
+    """End the process some seconds after a signal, also where the main thread misses it."""
     # the interpreter writes to it at once, while a library still calculates
     seen, written = os.pipe()
     os.set_blocking(written, False)

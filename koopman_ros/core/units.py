@@ -162,6 +162,11 @@ def quantity_text(value: float, unit: str, number_format: str = '.6g') -> str:
     return f'{shown(value, unit):{number_format}} {display_unit(unit)}'
 
 
+def difference_text(value: float, unit: str, number_format: str = '.4g') -> str:
+    """Write a difference of values with its unit, e.g. '0.05 K'; one of dimension one has none."""
+    return f'{value:{number_format}}' + ('' if unit == '1' else f' {unit}')
+
+
 def values_by_name(units: Mapping[str, str], values: Sequence[float], label: str = '{}'
                    ) -> dict[str, float]:
     """

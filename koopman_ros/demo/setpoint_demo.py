@@ -27,7 +27,14 @@ from koopman_ros.core.plots import (
     legend,
     write_figures,
 )
-from koopman_ros.core.units import conversion, display_unit, printed, shown, unit_label
+from koopman_ros.core.units import (
+    conversion,
+    difference_text,
+    display_unit,
+    printed,
+    shown,
+    unit_label,
+)
 from koopman_ros.demo.console import LiveTable, read_options, run_demo
 from koopman_ros.demo.exported import ExportedLoop
 from koopman_ros.demo.line_demo import PLANT as LINE
@@ -170,7 +177,7 @@ def _conclusion(task: str, run: DemoRun, linear: OptimalTrajectory, setpoints: M
                 signals: Signals) -> str:
     """Say how near the set-points both controllers end."""
     own, other = (' and '.join(
-        f'{abs(error):.2g} {printed(signals.states[signal])}'.removesuffix(' 1')
+        printed(difference_text(abs(error), signals.states[signal], '.2g'))
         for signal, error in errors.items()) for errors in (
         {signal: run.final_error(signal, goal) for signal, goal in setpoints.items()},
         {signal: float(linear.states[-1, list(signals.states).index(signal)] - goal)

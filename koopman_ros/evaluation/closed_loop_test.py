@@ -132,7 +132,8 @@ class ClosedLoopTest:
                     'no closed loop could be tried: no steady state within the limits of the '
                     'inputs is far enough from the starts; record several steady states, or '
                     'widen the limits')
-        text = f'the law fails in {np.sum(self.failed)} of {self.loops} closed loops'
+        text = (f'the controller fails in {np.sum(self.failed)} of {self.loops} simulated closed '
+                'loops')
         if not self.failed.any():
             sound = self.ratios[~self.poor]
             worst = float(np.max(sound)) if len(sound) else math.nan
@@ -141,11 +142,13 @@ class ClosedLoopTest:
                 'well')
             return f'{text}; its cost is at most {worst:.3g} times that of a linear law{rest}'
         failed, lost = self.failed, np.isinf(self.excess)
-        counts = ((int(np.sum(failed & self.no_gain)), 'without a gain'),
-                  (int(np.sum(failed & lost & ~self.no_gain)), 'without reaching the set-point'),
+        counts = ((int(np.sum(failed & self.no_gain)), 'it has no gain'),
+                  (int(np.sum(failed & lost & ~self.no_gain)), 'it does not reach the set-point'),
                   (int(np.sum(failed & ~lost)),
-                   f'by a cost over {self.settings.most_excess:g} times that of a perfect model'))
-        return f'{text} ({", ".join(f"{n} {what}" for n, what in counts if n)}), {self.region}'
+                   f'it costs over {self.settings.most_excess:g} times as much as with a perfect '
+                   'model'))
+        how = ', '.join(f'in {n} {what}' for n, what in counts if n)
+        return f'{text} ({how}), {self.region}'
 
     def __repr__(self) -> str:
         """Keep the arrays out."""

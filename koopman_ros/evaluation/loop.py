@@ -24,7 +24,7 @@ from koopman_ros.core.arrays import Array, expect, frozen, short_repr
 from koopman_ros.core.plots import axis_label, draw_limits, drawing, time_axis
 from koopman_ros.core.signals import per_signal
 from koopman_ros.core.status import reason, StatusFormatter
-from koopman_ros.core.units import Displays, NANOSECONDS, printed, shown
+from koopman_ros.core.units import difference_text, Displays, NANOSECONDS, printed, shown
 from koopman_ros.model import LiftedModel
 
 # what is measured (n,) of a value (n,) at a time in s; NaN for what is not, None for no message
@@ -196,7 +196,8 @@ class LoopRun:
                   for j, name in enumerate(controller.controlled.names)
                   if name in outputs for i in [outputs.index(name)]]
         return self.failure or ', '.join(
-            f'{name.replace("_", " ")} ends {error:.2g} {printed(unit)} from its set-point'
+            printed(f'{name.replace("_", " ")} ends {difference_text(error, unit, ".2g")} from '
+                    'its set-point')
             for name, unit, error in errors if np.isfinite(error)) or 'no set-point'
 
 

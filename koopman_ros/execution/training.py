@@ -15,6 +15,7 @@ import time
 from typing import Any
 
 from koopman_ros.core.progress import show_bar
+from koopman_ros.core.units import difference_text
 from koopman_ros.execution.job import Job
 
 _CANCELLED = 'cancelled; nothing was written'
@@ -154,7 +155,7 @@ def outcome_text(summary: Mapping[str, Any]) -> str:
 
 
 def _errors(errors: Mapping[str, float | None], units: Mapping[str, str]) -> str:
-    return ', '.join(('infinite' if value is None else f'{value:.4g} {units[name]}')
+    return ', '.join(('infinite' if value is None else difference_text(value, units[name]))
                      + (f' in {name}' if len(errors) > 1 else '')
                      for name, value in errors.items())
 
@@ -178,7 +179,7 @@ def _class_line(one: Mapping[str, Any], units: Mapping[str, str]) -> str:
             'heldout_rx', 'closed_loops_failed', 'closed_loops'))
         parts = [f'drift rx {"infinite" if rx is None else f"{rx:.1e}"}',
                  f'roll-out {_errors(one["heldout_error"], units)}',
-                 f'law fails in {failed} of {loops} closed loops']
+                 f'controller fails in {failed} of {loops} simulated closed loops']
     line = 'chosen: ' * one['chosen'] + ', '.join([*parts, f'{one["seconds"]:.1f} s'])
     return '; '.join(filter(None, [line, one['limit'], one['rejection'] and (
         f'rejected: {one["rejection"]}')]))

@@ -20,7 +20,7 @@ from koopman_ros.core.arrays import Array, expect, frozen, short_repr, show_prin
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.plots import axis_label, drawing, time_axis, zoom
 from koopman_ros.core.solvers import differences
-from koopman_ros.core.units import SECONDS_PER_TIME_UNIT, shown
+from koopman_ros.core.units import difference_text, SECONDS_PER_TIME_UNIT, shown
 from koopman_ros.learning.identification import Drift, Identified, longest_step, Segments
 from koopman_ros.learning.identification.drift import Rate
 from koopman_ros.learning.lift.metrics import lifted_rate
@@ -76,12 +76,20 @@ class FreeRun:
         count = sum(map(len, self.episodes))
         return '\n  '.join([
             f'free run of {count} measurements, with the start fitted to the first {self.init}:',
-            *(f'{name}: error {rmse:.4g} {unit}, fit {fit:.1f} %' for name, unit, rmse, fit in zip(
-                self.names, self.units, self.rmse, self.fit, strict=True))])
+            *(f'{name}: {self._fit_text(i)}' if self._diverges(i) else
+              f'{name}: error {difference_text(self.rmse[i], self.units[i])}, {self._fit_text(i)}'
+              for i, name in enumerate(self.names))])
+
+    def _diverges(self, i: int) -> bool:
+        # an error of a hundred times the motion has no figure that tells more
+        return not self.fit[i] > -1e4
+
+    def _fit_text(self, i: int) -> str:
+        return 'diverges' if self._diverges(i) else f'fit {self.fit[i]:.1f} %'
 
     def error_text(self) -> str:
         """Return the errors in a line."""
-        return ', '.join(f'{rmse:.4g} {unit} in {name}' for name, unit, rmse in zip(
+        return ', '.join(f'{difference_text(rmse, unit)} in {name}' for name, unit, rmse in zip(
             self.names, self.units, self.rmse, strict=True))
 
     @property
@@ -133,8 +141,7 @@ class FreeRun:
                         zoom(axes, shown(episode.x[:, i], unit))
                         name = self.names[i]
                         if not k:
-                            axes.set_title('diverges' if not np.isfinite(self.fit[i]) else
-                                           f'fit {self.fit[i]:.1f} %', loc='left', fontsize=8)
+                            axes.set_title(self._fit_text(i), loc='left', fontsize=8)
                     else:
                         j = i - n_y
                         name, unit = inputs[j], self.plant.input_units[j]
@@ -174,8 +181,8 @@ def simulate(model: AnyModel, record: Record, init: int | None = None, *,
     :raises ValueError: for a record without the model's signals.
     """
     if not isinstance(model, AnyModel):
-        raise TypeError(f'model must be a model, as of learn(record).model or load(file), got '
-                        f'{type(model).__name__}')
+        raise TypeError('model must be one of learn(record).model or load(file), got '
+                        f'{type(model).__name__}: check the order of the arguments')
     expect(record=(record, Record))
     if init is not None and not isinstance(init, Integral):
         raise TypeError(f'init must be a number of samples, an integer, got {init!r}')

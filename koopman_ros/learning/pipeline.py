@@ -19,7 +19,7 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.datasets import Episode, sample_interval
 from koopman_ros.core.paths import backup_path
 from koopman_ros.core.progress import progress_line
-from koopman_ros.core.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
+from koopman_ros.core.units import difference_text, NANOSECONDS, SECONDS_PER_TIME_UNIT
 from koopman_ros.execution import Backend, backend_of
 from koopman_ros.learning.acceptance import (
     AcceptanceResult,
@@ -212,8 +212,9 @@ def _failed_runs(runs: Mapping[str, FreeRun], others: Mapping[str, Mapping[str, 
         elif test:
             # motion below the usual error is none
             yield from (
-                f'its free run of the test record errs by {rmse:.4g} {unit} in {state}, more than '
-                f'the mean value does (fit {fit:.1f} %): record under such conditions, too'
+                f'its free run of the test record errs by {difference_text(rmse, unit)} in '
+                f'{state}, more than the mean value does (fit {fit:.1f} %): record under such '
+                'conditions, too'
                 for state, unit, rmse, fit, usual in zip(
                     own.names, own.units, own.rmse, own.fit, runs['record'].rmse, strict=True)
                 if fit < 0.0 and rmse > (1.0 - fit / 100.0) * usual)

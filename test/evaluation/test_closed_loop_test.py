@@ -82,7 +82,7 @@ def test_on_a_linear_plant_the_law_is_the_linear_one():
     assert found.ratios == pytest.approx(np.ones(32), abs=1e-8)
     assert found.accepted
     assert found.region == ''
-    assert str(found).startswith('the law fails in 0 of 32 closed loops;')
+    assert str(found).startswith('the controller fails in 0 of 32 simulated closed loops;')
     # all over the box, in each of its quarters
     for x in (found.starts, found.setpoints):
         assert np.all((x >= TWO.lower) & (x <= TWO.upper))
@@ -114,7 +114,7 @@ def test_an_input_of_the_wrong_sign_is_rejected():
     assert (found.loops, found.arrived, found.share_failed) == (16, 0, 1.0)
     assert not found.no_gain.any()
     assert math.isinf(found.worst_ratio)
-    assert '16 of 16 closed loops (16 without reaching' in str(found)
+    assert '16 of 16 simulated closed loops (in 16 it does not reach' in str(found)
     assert len(repr(found)) < 300
 
 
@@ -179,7 +179,7 @@ def test_a_costly_law_is_rejected_by_its_cost():
     assert found.ratios == pytest.approx(np.full(16, expected), rel=1e-4)
     # of a linear plant it is the same law
     assert found.excess == pytest.approx(found.ratios, rel=1e-4)
-    assert '(16 by a cost over 1.05 times that of a perfect model)' in str(found)
+    assert '(in 16 it costs over 1.05 times' in str(found)
 
 
 def test_setpoints_out_of_reach_within_limits_are_judged_without_limits():
@@ -253,7 +253,7 @@ def test_a_cost_that_a_better_model_would_save_counts_against_a_model():
     assert alone.any()
     assert (found.ratios[alone] == 0.0).all()
     assert found.arrived == found.loops - alone.sum()
-    assert 'by a cost over 1.05 times that of a perfect model' in str(found)
+    assert 'it costs over 1.05 times' in str(found)
 
 
 def test_a_model_keeps_the_loops_in_which_its_law_is_lost():

@@ -67,8 +67,8 @@ def test_class_is_passed_on_and_each_that_was_learned_is_shown(
     assert run_here(trainer, task='train', bags='[run]', model_class=name) == 2
     said = capfd.readouterr().err
     assert re.search(rf'\[WARN\].*the new model \(.+\) is rejected: {name}\n', said)
-    assert ('linear: chosen: drift rx 2.0e-02, roll-out 0.5 K, law fails in 1 of 128 closed '
-            'loops, 0.0 s\n') in said
+    assert ('linear: chosen: drift rx 2.0e-02, roll-out 0.5 K, controller fails in 1 of 128 '
+            'simulated closed loops, 0.0 s\n') in said
     assert 'free lift: 2.0 s; rejected: it has lost a state\n' in said
 
 

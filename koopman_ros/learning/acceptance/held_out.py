@@ -12,7 +12,7 @@ import numpy as np
 from koopman_ros.control.usable import unusable
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.datasets import sample_interval
-from koopman_ros.core.units import SECONDS_PER_TIME_UNIT
+from koopman_ros.core.units import difference_text, SECONDS_PER_TIME_UNIT
 from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest, evaluate_closed_loops, Rate
 from koopman_ros.execution import Backend
 from koopman_ros.learning.acceptance.plant_test import LoopConditions, PlantTest, run_plants
@@ -173,5 +173,5 @@ def _size(rmse: Array, scale: Array) -> float:
 
 def _text(rmse: Array, model: LiftedModel) -> str:
     names, units = model.states.names, model.states.units
-    return ', '.join(f'{value:.4g} {unit}' + (f' in {name}' if len(names) > 1 else '')
+    return ', '.join(difference_text(value, unit) + (f' in {name}' if len(names) > 1 else '')
                      for value, unit, name in zip(rmse, units, names, strict=True))

@@ -29,9 +29,9 @@ def record_warnings(found: Identified, model: LiftedModel, error: Array, autocor
             warnings.append(
                 f'the noise of {name} is coloured (autocorrelation {r:.2f} from sample to sample '
                 'in the residuals of the best drift), because of a filter before the recording or '
-                'an unmeasured quantity. With white noise '
-                f'{100.0 * (1.0 - r) / (1.0 + r):.0f} % of the samples would tell as much: record '
-                'longer, or without the filter')
+                'an unmeasured quantity. Successive samples repeat it: the record counts as '
+                f'{100.0 * (1.0 - r) / (1.0 + r):.0f} % of its samples with independent noise. '
+                'Record longer, or without the filter')
         noise = np.fmin(found.noise[i], error[i])
         excess = float(np.sqrt(max(0.0, error[i] ** 2 - noise ** 2)))
         # the mean square of `count` white errors strays by this share

@@ -70,8 +70,8 @@ def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:
     :param x: (N, n_x) states, in state units.
     :param dxdt: (N, n_x) their derivatives, in state units per time unit.
     :param u: (N, n_u) inputs, in input units.
-    :raises ValueError: when the samples do not distinguish the coordinates, or do not fit the
-        model.
+    :raises ValueError: when the coordinates depend on each other over the samples, or the samples
+        do not fit the model.
     """
     xi, f = _drifts(model, x, dxdt, u)
     z, J = model.lift_and_jacobian(xi)
@@ -80,8 +80,9 @@ def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:
     S = z.T @ z / len(z)
     cond = float(np.linalg.cond(S))
     if not cond < _MAX_COND:
-        raise ValueError(f'{len(z)} samples do not distinguish {model.n_z} coordinates: use '
-                         'samples that move more, or a smaller lifted_dimension (n_z)')
+        raise ValueError(f'{model.n_z} lifted coordinates depend on each other over the {len(z)} '
+                         f'samples (condition number {cond:.1e}, must be below {_MAX_COND:.0e}): '
+                         'record over a wider range, or choose a smaller lifted_dimension (n_z)')
     factor = np.linalg.cholesky(S)
     residual = np.linalg.solve(factor, (dz - z @ model.A.T).T)
     reference = np.linalg.solve(factor, dz.T)

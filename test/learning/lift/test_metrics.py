@@ -93,7 +93,7 @@ def test_states_that_move_together_are_not_coordinates_that_collapsed():
 @pytest.mark.parametrize('movement', [0.0, 1e-5])
 def test_samples_that_hardly_move_are_rejected(movement):
     still = 3.5 + movement * np.random.default_rng(0).normal(size=(40, 1))
-    with pytest.raises(ValueError, match='40 samples do not distinguish'):
+    with pytest.raises(ValueError, match='over the 40 samples'):
         fit(random_lift(1, n_free=2), still, np.zeros((40, 1)), np.zeros((40, 1)))
 
 
