@@ -55,7 +55,7 @@ def work():
         try:
             time.sleep(600.0)
         except KeyboardInterrupt:
-            print('caught', flush=True)
+            pass
 
 process_entry.importlib = types.SimpleNamespace(
     import_module=lambda name: types.SimpleNamespace(main=work))
@@ -70,6 +70,6 @@ def test_a_program_ends_soon_after_a_signal_whatever_it_does(number: int) -> Non
         assert process.stdout is not None
         assert process.stdout.readline() == 'begun\n'
         process.send_signal(number)
-        said, complaint = process.communicate(timeout=60.0)
-    assert (process.returncode, said) == (130, 'caught\n')
+        _, complaint = process.communicate(timeout=60.0)
+    assert process.returncode == 130
     assert 'interrupted' in complaint
