@@ -50,7 +50,7 @@ def run_program(module: str, interrupted: int, patience: float = 0.0) -> int:
     except KeyboardInterrupt:
         codes.append(interrupted)
         if patience:
-            threading.Event().wait(2.0 * patience)  # for its end, which says so
+            threading.Event().wait()  # for the end by the thread, which says so
     finally:
         handle_signals(signal.SIG_IGN)
     return codes[0]
