@@ -79,10 +79,11 @@ def bent():
 
 @pytest.mark.parametrize(('effect', 'accepted'), [
     (lambda u: u, True), (lambda u: np.sign(u) * np.maximum(np.abs(u) - 0.5, 0.0), False),
+    (lambda u: np.tanh(2.0 * u), False),
     # at rest without a torque, which an affine drift is not
     (lambda u: u ** 2, False)])
 def test_a_law_is_tried_on_inputs_that_act_nonlinearly(effect, accepted):
-    """Exact rates of a pendulum whose actuator has a dead zone, or acts by the square."""
+    """Exact rates of a pendulum whose actuator has a dead zone, saturates, or squares."""
     rng = np.random.default_rng(0)
     x, u = rng.uniform(-1.5, 1.5, (900, 2)), rng.uniform(-1.4, 1.4, (900, 1))
     rate = np.column_stack([x[:, 1], effect(u[:, 0]) - np.sin(x[:, 0]) - 0.5 * x[:, 1]])
