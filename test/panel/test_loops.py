@@ -46,6 +46,20 @@ def row(page: Page, namespace: str) -> Locator:
     return page.locator(f'tr[data-loop="{namespace.lstrip("/")}"]')
 
 
+# Texts of a row that cover the one before.
+OVERPRINTED = """() => [...document.querySelectorAll('.signals')].flatMap(row => {
+    const boxes = [...row.children].filter(one => one.innerText).map(one => {
+        const range = document.createRange();
+        range.selectNodeContents(one);
+        return [one.innerText, range.getBoundingClientRect()];
+    });
+    return boxes.slice(1).filter(([_, box], at) => {
+        const before = boxes[at][1];
+        return box.top < before.bottom && box.left < before.right && box.bottom > before.top;
+    }).map(([text]) => text);
+})"""
+
+
 def test_forty_loops_are_in_one_page_with_the_state_of_each(many: str, browser: Pages) -> None:
     with browser.page(many) as page:
         expect(page.locator('tr[data-loop]')).to_have_count(40)
@@ -63,6 +77,7 @@ def test_forty_loops_are_in_one_page_with_the_state_of_each(many: str, browser: 
         for width in (1400, 1024, 390):
             page.set_viewport_size({'width': width, 'height': 900})
             assert page.evaluate('document.documentElement.scrollWidth') <= width
+            assert page.evaluate(OVERPRINTED) == []
         # all of them on a large screen
         page.set_viewport_size({'width': 1920, 'height': 1600})
         expect(row(page, NAMES[-1])).to_be_in_viewport()
