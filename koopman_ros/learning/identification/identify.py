@@ -275,7 +275,11 @@ def identify(plant: PlantDescription, episodes: Sequence[Episode], *,
         left.remove(degree)
     if degrees[0] in best and degrees[0] not in finished:
         finish(degrees[0])
-    return Identified(finished[degree], best[degree][1].method, finished[min(finished)],
+    # an input matrix that depends on the state is no part of a linear model
+    linear = finished[min(finished)] if not plant.input_matrix_degree else identify(
+        replace(plant, input_matrix_degree=0), episodes, degrees=degrees[:1], methods=methods,
+        seed=seed, watch=lambda *_: watch(done, len(degrees) + 1, 'linear model')).drift
+    return Identified(finished[degree], best[degree][1].method, linear,
                       tuple(scores), noise_level(parts, finished[degree]),
                       (*fit, *choose), tuple(held_out), warnings=(*warnings, *failures),
                       alternatives=tuple(best[d][0] for d in good if d != degree),

@@ -14,8 +14,11 @@ from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.message_fields import place
 from koopman_ros.learning import retrain, TrainingTask
 from koopman_ros.learning.identification import (
+    identify,
     identify_measured,
     identify_with_characteristics,
+    prediction_error,
+    Segments,
     structure_search,
 )
 from koopman_ros.learning.identification.characteristics import NotMonotoneError, smoothed
@@ -106,6 +109,18 @@ def test_a_characteristic_is_found(g, low, high):
     true = (g(u) - g(u[0])) / (g(u[-1]) - g(u[0]))
     assert (one.effect(u) - u[0]) / (u[-1] - u[0]) == pytest.approx(true, abs=0.04)
     assert not any(isinstance(one, NonAffineDrift) for one in found.alternatives)
+
+
+def test_the_best_linear_model_has_a_constant_input_matrix():
+    """A tank whose inflow also cools it: the drift is linear, the effect of the input is not."""
+    found = identify(replace(PLANT, input_matrix_degree=1),
+                     [record(lambda x, u: 1.0 - x - 0.8 * x * u, -0.5, 1.0)], degrees=(1,),
+                     methods=methods(20))
+    assert found.drift.varying_input_matrix
+    assert not found.linear.varying_input_matrix
+    errors = [np.mean(prediction_error(rate, Segments.of(found.held_out, PERIOD), np.ones(1)))
+              for rate in (found.drift.rate, found.linear.rate)]
+    assert errors[0] < 0.7 * errors[1]
 
 
 @pytest.mark.parametrize('seed', range(2))
