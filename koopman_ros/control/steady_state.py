@@ -27,8 +27,8 @@ def steady_state_target(model: LiftedModel, setpoint: Array, w: Array | None = N
     """
     Find the steady state nearest to a set-point under a disturbance; all in scaled deviations.
 
-    Its states are no further out than those of a prediction. Of several that are as near it is the
-    one nearest to the nominal point. Where the inputs would have to leave their range it is the
+    Its states are within the bounds of a prediction. Of several that are as near it is the one
+    nearest to the nominal point. Where the inputs would have to leave their range it is the
     nearest that inputs within the range hold. If there is none, or only one input, the target
     keeps an input out of range: saturated, the law comes as near as it can.
 
