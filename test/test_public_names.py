@@ -288,7 +288,7 @@ WRONG = {
     # settings
     'pair for limits': (lambda m: controller(m, limits=(0.0, 12.0)), TypeError, 'InputLimits'),
     'three limits of two': (lambda m: InputLimits(lower=[0.0, 0.0], upper=[1.0, 1.0, 1.0]),
-                            ValueError, 'upper 3'),
+                            ValueError, 'upper must be as long'),
     'column of limits': (lambda m: InputLimits(lower=[[0.0], [0.0]], upper=12.0), ValueError,
                          'lower'),
     'complex limits': (lambda m: InputLimits(upper=1j), ValueError, 'real'),

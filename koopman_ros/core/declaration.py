@@ -69,8 +69,9 @@ class Settings:
                                      f'{_ONE_OF[of.signals]}, got {numbers.tolist()}')
                 other, length = lengths.setdefault(of.signals, (item.name, len(numbers)))
                 if length != len(numbers):
-                    raise ValueError(f'{other} has {length} numbers and {item.name} '
-                                     f'{len(numbers)}: give one per {_ONE_OF[of.signals]}')
+                    raise ValueError(f'{other} and {item.name} must be as long as each other, '
+                                     f'got {length} and {len(numbers)}: give one number per '
+                                     f'{_ONE_OF[of.signals]}')
             if of.none is not None and np.any(numbers == of.none[0]):
                 numbers = np.where(numbers == of.none[0], of.none[1], numbers)
             object.__setattr__(self, item.name, numbers if numbers.ndim else float(numbers))

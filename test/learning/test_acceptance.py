@@ -229,7 +229,7 @@ def test_a_controller_that_destabilises_is_rejected(found, trained, shipped):
     decision = evaluate_model(found, wrong, shipped, Thresholds(), loops=16)
     assert decision.law_check.share_failed > 0.9
     (reason,) = (reason for reason in decision.reasons if 'control' in reason)
-    assert 'of 16 closed loops' in reason
+    assert 'of 16 simulated closed loops' in reason
     assert f'{decision.law_check.region}' in reason
 
 
@@ -356,8 +356,8 @@ def test_noise_that_is_coloured_is_named(found, trained, shipped, colour):
     if not colour:
         assert decision.warnings == ()
         return
-    match = re.search(r'temperature is coloured \(autocorrelation (0\.\d\d).* (\d+) % of the '
-                      'samples', decision.warnings[0])
+    match = re.search(r'temperature is coloured \(autocorrelation (0\.\d\d).* counts as (\d+) % '
+                      'of its samples', decision.warnings[0])
     # of three segments of 60 samples, whose starts are fitted
     r = float(match[1])
     assert r == pytest.approx(0.8, abs=0.2)

@@ -299,7 +299,7 @@ def test_a_task_survives_json():
     ({'states': (replace(STATES[0], place=replace(STATES[0].place, topic='/other')),)},
      BagReadError, "has no topic '/other'"),
     ({'margin': 2.0}, ValueError, 'margin = 2.0'),
-    ({'disturbances': ('feed',)}, ValueError, 'disturbance_names has feed, must be some of'),
+    ({'disturbances': ('feed',)}, ValueError, 'the disturbances have feed, must be some of'),
     ({'disturbances': ('coolant_temperature',), 'input_matrix_degree': 1}, ValueError,
      'must not depend on the state: give a constant B'),
     ({'model': '', 'input_gain': {'temperature': {'steam': 1.0}}}, ValueError,
