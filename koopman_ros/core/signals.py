@@ -14,6 +14,21 @@ from numpy.typing import ArrayLike
 from koopman_ros.core.arrays import Array, frozen, real
 
 
+def check_text(what: str, text: object, longest: int = 100) -> None:
+    """
+    Check a text that a model file holds; its names have at most 100 characters.
+
+    :raises TypeError: unless it is a string.
+    :raises ValueError: where it is longer, or has characters that cannot be printed.
+    """
+    if not isinstance(text, str):
+        raise TypeError(f'{what} must be a string, got {text!r}')
+    if len(text) > longest:
+        raise ValueError(f'{what} has {len(text)} characters, the maximum is {longest}')
+    if not text.isprintable():
+        raise ValueError(f'{what} = {text!a} contains unprintable characters')
+
+
 def numbers(name: str, value: Any, signals: Sequence[str], remedy: str = '') -> Array:
     """
     Return one number for each of some signals (n,) as an array.

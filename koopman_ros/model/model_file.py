@@ -19,6 +19,7 @@ import safetensors.numpy
 from koopman_ros.core.arrays import expect
 from koopman_ros.core.characteristic import Characteristic
 from koopman_ros.core.paths import write_atomically
+from koopman_ros.core.signals import check_text
 from koopman_ros.core.units import check_unit
 from koopman_ros.model.coordinates import Coordinates, NO_SIGNALS
 from koopman_ros.model.input_matrix import InputTerms
@@ -40,7 +41,6 @@ _MAX_BYTES = 1 << 22
 MAX_COORDINATES = 32
 _MAX_STATES = 32  # and inputs; as many as coordinates
 _MAX_DEGREE = 32  # of monomials; beyond some ten, little of them is left in numbers
-_MAX_NAME = 100  # characters; a SHA-256 in hexadecimal has 64
 _MAX_SENTENCE = 4000
 _MAX_SEED = 1 << 128  # numpy's own seeds have up to 128 bits
 _MAX_ENTRIES = 100  # metrics, or reasons
@@ -145,16 +145,16 @@ def check(model: LiftedModel) -> None:
             raise ValueError(f'{name} is {size}, the maximum is {limit}')
     for signals in (model.states, model.inputs, model.disturbances):
         for name, unit in zip(signals.names, signals.units, strict=True):
-            _check_text('the name of a signal', name)
-            _check_text(f'the unit of {name}', unit)
+            check_text('the name of a signal', name)
+            check_text(f'the unit of {name}', unit)
             check_unit(unit)
-    for name in ('plant', 'data_digest', 'package_version', 'method'):
-        _check_text(name, getattr(origin, name), _MAX_SENTENCE if name == 'method' else _MAX_NAME)
-    for kind, text in (('closed_loops', origin.closed_loops),
+    for name in ('plant', 'data_digest', 'package_version'):
+        check_text(name, getattr(origin, name))
+    for kind, text in (('method', origin.method), ('closed_loops', origin.closed_loops),
                        *(('a reason', reason) for reason in origin.reasons)):
-        _check_text(kind, text, _MAX_SENTENCE)
+        check_text(kind, text, _MAX_SENTENCE)
     for name, value in origin.metrics.items():
-        _check_text('the name of a metric', name)
+        check_text('the name of a metric', name)
         if not math.isfinite(value):
             raise ValueError(f'the metric {name} is {value}, not finite')
     if origin.seed is not None and not (
@@ -201,15 +201,6 @@ def _check_size(what: str, values: NDArray[Any], names: tuple[tuple[str, ...] | 
         place = ', '.join(str(i) if axis is None else axis[i]
                           for i, axis in zip(at, names, strict=True))
         raise ValueError(f'{what}[{place}] is {values[at]:.6g}, allowed are -{most:g} to {most:g}')
-
-
-def _check_text(what: str, text: object, longest: int = _MAX_NAME) -> None:
-    if not isinstance(text, str):
-        raise TypeError(f'{what} must be a string, got {text!r}')
-    if len(text) > longest:
-        raise ValueError(f'{what} has {len(text)} characters, the maximum is {longest}')
-    if not text.isprintable():
-        raise ValueError(f'{what} = {text!a} contains unprintable characters')
 
 
 def _description(model: LiftedModel) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from numbers import Real
 import os
 from pathlib import Path
-import reprlib
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -18,6 +17,7 @@ import numpy as np
 from koopman_ros.core.arrays import expect, short_repr, show_printed
 from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.message_fields import base_name, place, SIGNAL_NAME
+from koopman_ros.core.signals import check_text
 from koopman_ros.core.units import check_unit, NANOSECONDS
 from koopman_ros.records.episodes import loop_episodes
 from koopman_ros.records.import_spec import ImportReport, RecordedInput, RecordedState
@@ -27,7 +27,6 @@ from koopman_ros.records.tables import SignalColumn, Source, table_of
 #: Names of signals: ``'level'``, ``'level [m]'``, ``'level = LT101.PV [m]'``.
 Names: TypeAlias = str | Sequence[str]
 
-_LONGEST_NAME = 100  # of a plant, in characters, as in model files
 _BAGS = ('.mcap', '.db3')
 
 
@@ -165,9 +164,7 @@ def read(source: Source, states: Names, inputs: Names, *, time: str = '', period
     report.dropped = +report.dropped
     files = tuple(os.fspath(one) for one in sources if isinstance(one, str | os.PathLike))
     name = name or Path(files[0] if files else 'plant').stem
-    if not name.isprintable() or len(name) > _LONGEST_NAME:
-        raise ValueError(f'name = {reprlib.repr(name)} of the plant must be at most '
-                         f'{_LONGEST_NAME} printable characters: give a shorter name')
+    check_text('the name of the plant', name)
     if not episodes:
         raise ValueError('the record holds no usable segment of measurements: '
                          + '; '.join(report.lines()))
