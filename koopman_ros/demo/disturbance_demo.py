@@ -64,6 +64,7 @@ def run_disturbance(output: Path, speed: float) -> dict[str, object]:
             operator.run_until(_STEP_TIME)
             operator.set('plant', **{f'constants.{FEED}': reactor.constant(FEED) + STEP})
             operator.run_until(operator.seconds + _AFTER)
+            operator.wait_for_recording()
         runs[name] = _read(scenario, bag)
     peaks = {name: run.peak for name, run in runs.items()}
     result: dict[str, object] = {

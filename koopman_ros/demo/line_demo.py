@@ -60,6 +60,7 @@ def run_line(output: Path, speed: float) -> dict[str, object]:
         operator.run_until(FEED_TIME)
         operator.set('plant', **{f'constants.{FEED}': to_celsius(COLD)})
         operator.run_until(operator.seconds + _DURATION - FEED_TIME)
+        operator.wait_for_recording()
 
     run, feed = read_run(wiring, bag), read_signal(
         bag, wiring.measured_disturbances[FEED], 'K')

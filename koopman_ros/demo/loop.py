@@ -131,6 +131,28 @@ class Operator:
     def _answered_after(self, stamp_ns: int) -> bool:
         return self.last_stamp_ns > stamp_ns
 
+    def wait_for_recording(self) -> None:
+        """
+        Wait until the trainer has recorded the loop from its start to the last command received.
+
+        Messages that reached the operator may still be on their way to the trainer, and are lost
+        when either end of the connection is stopped.
+        """
+        samples = round(self.seconds / self.scenario.sample_period) + 1
+        topics = [place.topic for place in (
+            *self._wiring.measured.values(), *self._wiring.commands.values())]
+
+        def missing() -> str:
+            status = self.harness.last_status('trainer: recording')
+            counts = {} if status is None else {item.key: item.value for item in status.values}
+            lost = {topic: samples - int(counts.get(f'messages on /{topic}', 0))
+                    for topic in topics}
+            return ', '.join(f'{count} of {samples} messages on /{topic}'
+                             for topic, count in lost.items() if count > 0)
+
+        self.harness.wait_until(lambda: not missing(),
+                                lambda: f'the recording lacks {missing()}: {BUSY}')
+
     def request_setpoints(self, setpoints: Mapping[str, float], seconds: float) -> None:
         """Publish set-points, stamped with the plant time in s from which they hold."""
         if self._setpoints is None:
@@ -293,21 +315,6 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
 def run_loop(scenario: Scenario, bag: Path, logs: Path,
              on_row: Callable[[Row], None] = lambda _: None) -> None:
     """Run a loop until the scenario's end, recorded whole by the trainer in a new bag."""
-    samples = round(scenario.duration / scenario.sample_period) + 1
-    topics = [place.topic for place in (
-        *scenario.wiring.measured.values(), *scenario.wiring.commands.values())]
-
     with running_loop(scenario, logs, {'output': bag}, on_row) as operator:
-        def missing() -> str:
-            status = operator.harness.last_status('trainer: recording')
-            counts = {} if status is None else {item.key: item.value for item in status.values}
-            lost = {topic: samples - int(counts.get(f'messages on /{topic}', 0))
-                    for topic in topics}
-            return ', '.join(f'{count} of {samples} messages on /{topic}'
-                             for topic, count in lost.items() if count > 0)
-
         operator.run_until(scenario.duration)
-        # messages the operator received may still be on their way to the trainer, and are lost
-        # with its sender
-        operator.harness.wait_until(lambda: not missing(),
-                                    lambda: f'{bag} lacks {missing()}: {BUSY}')
+        operator.wait_for_recording()

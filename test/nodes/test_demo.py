@@ -11,12 +11,15 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 
 import pytest
 import rclpy
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.demo import disturbance_demo, line_demo, retraining_demo, setpoint_demo
+from koopman_ros.demo.loop import running_loop, Scenario
+from koopman_ros.demo.results import read_run
 from koopman_ros.event_log.records import parse
 from koopman_ros.event_log.run import replay_records
 from koopman_ros.parameters.signal_topics import plant_defaults
@@ -88,6 +91,22 @@ def test_a_loop_with_dead_time_reaches_the_optimal_cost_and_beats_pi_control(
     assert max(learned['overshoot_up'], learned['overshoot_down']) < 0.2
     assert learned['feed_peak'] < 1.1 * result['optimum']['feed_peak']
     assert (tmp_path / 'closed_loop.png').read_bytes().startswith(b'\x89PNG')
+
+
+def test_a_recording_holds_what_the_operator_saw_of_a_loop_whose_trainer_fell_behind(
+        tmp_path: Path) -> None:
+    bag = tmp_path / 'loop.mcap'
+    scenario = Scenario({'temperature': 330.0}, duration=0.0)
+    with running_loop(scenario, tmp_path / 'logs', {'output': bag}) as operator:
+        trainer = next(one for one in operator.harness.processes if one.name == 'trainer')
+        operator.run_until(20.0)
+        trainer.process.send_signal(signal.SIGSTOP)
+        operator.run_until(400.0)
+        resumed = threading.Timer(1.0, trainer.process.send_signal, [signal.SIGCONT])
+        resumed.start()
+        operator.wait_for_recording()
+        resumed.join()
+    assert read_run(scenario.wiring, bag).command_seconds[-1] >= 400.0
 
 
 def test_a_demo_that_cannot_run_gives_the_reason_in_one_line(
