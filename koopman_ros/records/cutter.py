@@ -65,9 +65,10 @@ def spikes_and_jumps(values: Array, least: float = 0.0, rules: CuttingRules = RU
     for _ in range(rules.passes):
         kept = np.flatnonzero(~spike)
         found = _far_from_neighbours(values[kept], least, rules)
-        # also a single one on a ramp, whose neighbours differ: it leaps away and back
-        large = _large_changes(values[kept], least, rules)
-        found[1:-1] |= large[:-1] * large[1:] < 0
+        if not found.any():
+            # a single one on a ramp, whose neighbours differ: it leaps away and back
+            large = _large_changes(values[kept], least, rules)
+            found[1:-1] = large[:-1] * large[1:] < 0
         spike[kept[found]] = True
         if not found.any():
             break
@@ -85,8 +86,9 @@ def _large_changes(values: Array, least: float, rules: CuttingRules) -> NDArray[
 
 
 def _far_from_neighbours(values: Array, least: float, rules: CuttingRules) -> NDArray[np.bool_]:
-    around = np.lib.stride_tricks.sliding_window_view(
-        np.pad(values, rules.neighbours, mode='edge'), 2 * rules.neighbours + 1)
+    windows = np.lib.stride_tricks.sliding_window_view(values, 2 * rules.neighbours + 1)
+    # at both ends the neighbours are on one side
+    around = windows[np.clip(np.arange(len(values)) - rules.neighbours, 0, len(windows) - 1)]
     middle = np.median(around, axis=1)
     local = np.median(np.abs(around - middle[:, None]), axis=1)
     away = np.abs(values - middle)
