@@ -120,8 +120,8 @@ def read(source: Source, states: Names, inputs: Names, *, time: str = '', period
     :param inputs: inputs that acted from the time of their row on. In a bag, an input is its
         commands and its measurements, on the usual topics of its name.
     :param time: column of the time, by default ``time`` or an index of dates. Dates and durations
-        are recognised; numbers are seconds, since 1970 too, or of the unit in the header or below:
-        ns, us, ms, s, min, h, d.
+        are recognised, and times of a day in a column ``date``; numbers are seconds, since 1970
+        too, or of the unit in the header or below: ns, us, ms, s, min, h, d.
     :param period: time between rows in s, in place of a column.
     :param linear: inputs that are linear from row to row, such as measurements of a slow actuator.
     :param tolerance: largest difference in s between the stamps of one sample in a bag.
@@ -156,7 +156,7 @@ def read(source: Source, states: Names, inputs: Names, *, time: str = '', period
             episodes += found
             continue
         table = table_of(one, label).with_tags(
-            signal.column for signal in (*of_states, *of_inputs))
+            [signal.column for signal in (*of_states, *of_inputs)], time)
         of_states, of_inputs = (tuple(signal.with_unit_in(table, report) for signal in some)
                                 for some in (of_states, of_inputs))
         episodes += import_table(table, table.seconds(time, period, dayfirst, report.note),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 import os
 from pathlib import Path
 import re
@@ -22,14 +22,14 @@ from koopman_ros.core.units import check_unit
 from koopman_ros.records.cells import CellError, decimal_mark, numbers
 from koopman_ros.records.import_spec import ImportReport
 from koopman_ros.records.text_tables import read_text_table
-from koopman_ros.records.times import number_seconds, text_seconds, TIME_UNITS
+from koopman_ros.records.times import number_seconds, text_seconds, TIME_OF_DAY, TIME_UNITS
 
 #: A file or folder, a DataFrame, or columns by name.
 Source: TypeAlias = Any
 
 _TEXT = ('.csv', '.txt', '.tsv', '.dat', '.lvm')
-_TIME_NAMES = ('time', 't', 'timestamp', 'datetime', 'date', 'x_value')
-_VALUE_NAMES = ('value', 'values', 'val', 'wert')
+_TIME_NAMES = ('time', 't', 'timestamp', 'datetime', 'timestring', 'date', 'x_value')
+_VALUE_NAMES = ('value', 'values', 'wert')
 
 
 @cache
@@ -125,7 +125,8 @@ class Table:
         column = self.frame[k]
         if column.dtype.kind in 'biufcmM':
             return None
-        return [str(cell).strip() if known else '' for cell, known in zip(
+        # some languages write another minus
+        return [str(cell).strip().replace('\u2212', '-') if known else '' for cell, known in zip(
             column.tolist(), column.notna(), strict=True)]
 
     def numbers(self, k: int) -> Array:
@@ -141,6 +142,9 @@ class Table:
                                  f'{column.dtype}: name a column of real numbers')
             values = column.to_numpy(dtype=np.float64, na_value=np.nan)
             return np.where(np.isfinite(values), values, np.nan)
+        return self._numbers(k, cells)
+
+    def _numbers(self, k: int, cells: Sequence[str]) -> Array:
         try:
             return numbers(cells, self._decimal_mark)
         except CellError as error:
@@ -166,14 +170,15 @@ class Table:
         name = re.escape(name_and_unit(self.headers[k])[0].lower())
         for other, header in enumerate(self.headers):
             if other == k or not re.fullmatch(
-                    rf'({name})?[\s_./:-]*quality', header.strip().lower()):
+                    rf'({name})?[\s_./:-]*quality\s?(detail)?', header.strip().lower()):
                 continue
             if self._has_numbers(other):
                 codes = self.numbers(other)
                 good = (codes // 64 == 3.0) & ~np.any(codes % 1.0 > 0.0)
             else:
                 good = np.char.startswith(np.char.lower(self.cells(other) or ['']), 'good')
-            return (header, ~good) if good.any() else None
+            if good.any():
+                return header, ~good
         return None
 
     def first_text(self, k: int) -> str:
@@ -185,7 +190,7 @@ class Table:
         return ValueError(f'{self.label}: the record has no column {column!r}, it has '
                           f'{", ".join(map(repr, self.headers))}: name one of them')
 
-    def with_tags(self, wanted: Iterable[str]) -> Table:
+    def with_tags(self, wanted: Iterable[str], time: str = '') -> Table:
         """
         Return a table with a column for each of some signals, of one with a row for each value.
 
@@ -203,17 +208,16 @@ class Table:
         else:
             tag = -1
         named = [k for k, header in enumerate(self.headers)
-                 if name_and_unit(header)[0].strip('_').lower() in _VALUE_NAMES]
+                 if name_and_unit(header)[0].strip('_').lower().endswith(_VALUE_NAMES)]
         if tag < 0:
-            if not named:
-                return self
             texts = [f'{self.headers[k]!r} ({", ".join(sorted(set(cells))[:5])})' for k in self.
                      frame.columns if (cells := self.cells(k)) and not self._has_numbers(k)]
+            if not (named and texts):
+                return self
             raise ValueError(f'{self.label} has no column {lacking[0]!r}, but a row for each '
                              f'value: name the signals as in {" or ".join(texts)}')
-        time = self.time_column('')[0]
-        found = named or [k for k in self.frame.columns
-                          if k not in (tag, time) and self._has_numbers(k)]
+        found = named or [k for k in self.frame.columns if k not in (
+            tag, self.time_column(time)[0]) and self._has_numbers(k)]
         if len(found) != 1:
             raise ValueError(f'{self.label} has a row for each value of {self.headers[tag]!r}, '
                              'and its values may be in ' + ' or '.join(
@@ -280,31 +284,32 @@ class Table:
             return period * np.arange(len(self.frame), dtype=np.float64)
         k, unit = self.time_column(time)
         column, cells, label = self.frame[k], self.cells(k), self.headers[k]
-        in_seconds = partial(number_seconds, unit=unit, name=label,
-                             note=lambda text: note(f'{self.label}: {text}'))
         if not self.first_text(k):
             raise ValueError(f'{self.label}: the column {label!r} holds no times: name another '
                              'one')
         if column.dtype.kind in 'mM':
             since = column if column.dtype.kind == 'm' else column - column.dropna().iloc[0]
             return since.dt.total_seconds().to_numpy(dtype=np.float64)
-        try:
-            if cells is None:
-                whole = column.dtype.kind in 'iu'
-                return in_seconds(column.to_numpy(
-                    np.int64 if whole else np.float64, **({} if whole else {'na_value': np.nan})))
-            if all(cell.isdecimal() and len(cell) < 19 for cell in cells):
-                return in_seconds(np.array(cells, dtype=np.int64))
+        if cells and all(map(TIME_OF_DAY.fullmatch, filter(None, cells))):
+            for date, header in enumerate(self.headers):
+                if header.strip().lower() in ('date', 'datum') and (days := self.cells(date)):
+                    cells = list(map(' '.join, zip(days, cells, strict=True)))
+        times: Any = None
+        if cells is None:
+            whole = column.dtype.kind in 'iu' and column.notna().all()
+            times = column.to_numpy(np.int64) if whole else self.numbers(k)
+        elif all(cell.isdecimal() and len(cell) < 19 for cell in cells):
+            times = np.array(cells, dtype=np.int64)
+        else:
             mostly = [bool(re.match(r"[-+]?[.,]?\d[\d.,' ]*([eE][-+]?\d+)?$", cell))
                       and not re.match(r'\d+\.\d+\.\d', cell) for cell in cells]
             if 2 * sum(mostly) > len(cells):
-                return in_seconds(numbers(
-                    [cell if number else '' for cell, number in zip(cells, mostly, strict=True)],
-                    self._decimal_mark))
-            return text_seconds(cells, label, dayfirst)
-        except CellError as error:
-            raise ValueError(f'{self.label}, row {self.frame.index[error.row]}, column {label!r}: '
-                             f'{error.cell!r} {error.why}') from error
+                times = self._numbers(k, [
+                    cell if number else '' for cell, number in zip(cells, mostly, strict=True)])
+        try:
+            if times is None:
+                return text_seconds(cells or [], label, dayfirst)
+            return number_seconds(times, unit, label, lambda text: note(f'{self.label}: {text}'))
         except ValueError as error:
             raise ValueError(f'{self.label}: {error}') from error
 

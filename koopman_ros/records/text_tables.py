@@ -101,7 +101,7 @@ class _Head(NamedTuple):
     headers: list[str]
     units: list[str]
     first: int  #: lines above the first row of numbers
-    rows: int  #: rows of numbers among the lines
+    rows: int  #: rows of numbers in a row among the lines
 
 
 def _head(lines: Sequence[str], separator: str) -> _Head | None:
@@ -119,25 +119,35 @@ def _head(lines: Sequence[str], separator: str) -> _Head | None:
         pass
     valued = [any(map(_VALUE.fullmatch, row)) for row in rows]
     widths = [len(row) if found else 0 for row, found in zip(rows, valued, strict=True)]
-    for k in range(1, len(rows)):
-        if widths[k] < 2 or widths[min(k + 1, len(rows) - 1)] != widths[k]:
+    heads, below = [], 0
+    for width, same in itertools.groupby(widths):
+        run = len(list(same))
+        k, below = below, below + run
+        if width < 2 or run < min(2, len(rows) - k):
             continue
-        # a separator may stand at the end of the rows, but not of the headers
-        fitting = (widths[k], widths[k] - (not rows[k][-1]))
         top = k
-        while top and not valued[top - 1] and len(rows[top - 1]) in fitting:
+        while top and not valued[top - 1] and _widths(rows[top - 1]) & _widths(rows[k]):
             top -= 1
-        block = rows[top:k]
+        block = [row[:width] for row in rows[top:k]]
         named = [row for row in block if not row[0].startswith('#') or row[0] == '#'] or [
             [row[0].lstrip('# '), *row[1:]] for row in block[-1:]]
         if named:
             # a title above the headers fills fewer cells
             best = max(range(len(named)), key=lambda i: (len(set(filter(None, named[i]))), -i))
-            units = [*named[best + 1:best + 2], [''] * widths[k]][0]
-            return _Head(separator, named[best], [*units, ''][:widths[k]], ends[k - 1],
-                         widths.count(widths[k]))
+            units = [*named[best + 1:best + 2], [''] * width][0]
+            heads.append(_Head(separator, named[best], [*units, ''][:width], ends[k - 1], run))
+    if heads:
+        # lines above may look like a small table, and the headers may be repeated
+        longest = max(heads, key=lambda one: one.rows)
+        return next(one for one in heads if one.headers == longest.headers)._replace(
+            rows=longest.rows)
     # columns that are called by numbers, and names
     if len(rows) > 1 and 1 < len(rows[0]) == len(rows[1]) and not all(
             map(_VALUE.fullmatch, rows[0])):
         return _Head(separator, rows[0], [''] * len(rows[0]), ends[0], len(rows) - 1)
     return None
+
+
+def _widths(row: Sequence[str]) -> set[int]:
+    """Return the possible widths of a row, which may end with a separator or a comment."""
+    return {len(row), len(row) - (row[-1].lower() in ('', 'comment'))}

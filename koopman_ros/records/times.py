@@ -16,6 +16,7 @@ import numpy as np
 from koopman_ros.core.arrays import Array
 from koopman_ros.core.units import conversion
 
+TIME_OF_DAY = re.compile(r'\d?\d:\d\d(:\d\d([.,:]\d+)?)?(\s?[AaPp]\.?[Mm]\.?)?')
 _DURATION = re.compile(r'(-?\d+ days?,? )?\+?\d+:\d\d:\d\d([.,]\d*)?')
 _DATE = re.compile(r'\d{1,4}[-/. ](\d{1,2}|[A-Za-z]{3,9})[-/. ]\d{1,4}|\d{8}T')
 _DAY_AND_MONTH = re.compile(r'^(\d{1,2})([-/.])(\d{1,2})\2\d{2,4}')
@@ -33,8 +34,8 @@ class TimeRules:
     longest: float = 1e9
     #: s since 1970 (1990 to 2100): times in ms, us and ns have more digits
     epoch: tuple[float, float] = (6.3e8, 4.1e9)
-    #: d since 1899-12-30 (2000 to 2100), as spreadsheets count
-    serial_days: tuple[float, float] = (36526.0, 73050.0)
+    #: d since 1899-12-30 and since the year 0 (2000 to 2100), as spreadsheets and MATLAB count
+    serial_days: tuple[tuple[float, float], ...] = ((36526.0, 73050.0), (730486.0, 767011.0))
     #: share of the rows whose time may be unreadable; they are left out
     unreadable: float = 0.05
 
@@ -50,6 +51,8 @@ def number_seconds(numbers: Any, unit: str, name: str, note: Callable[[str], Non
     :raises ValueError: for numbers that may be something else, with what to write.
     """
     finite = numbers[np.isfinite(numbers)]
+    if not len(finite):
+        raise ValueError(f'the column {name!r} holds no times: name another one')
     # whole nanoseconds since 1970 have more digits than a double
     first, since = finite[0], np.asarray(numbers - finite[0], dtype=np.float64)
     if unit:
@@ -66,10 +69,10 @@ def number_seconds(numbers: Any, unit: str, name: str, note: Callable[[str], Non
         raise ValueError(f'the times in {name!r}, e.g. {whole[0]}, may be dates without separators'
                          f': write them as 2026-01-31 14:00:00, or give their unit if they are '
                          f"not, as in time='{name} [s]'")
-    if rules.serial_days[0] <= low and high <= rules.serial_days[1]:
+    if any(first_day <= low and high <= last for first_day, last in rules.serial_days):
         raise ValueError(f'the times in {name!r}, from {low:.10g} to {high:.10g}, may be days as '
-                         f"spreadsheets count them, or seconds: write time='{name} [d]' or "
-                         f"time='{name} [s]'")
+                         "spreadsheets or MATLAB count them, or seconds: write "
+                         f"time='{name} [d]' or time='{name} [s]'")
     if high - low >= rules.longest or max(abs(low), abs(high)) > rules.epoch[1]:
         raise ValueError(f'the times in {name!r} go from {first} to {high:.6g}, which cannot be '
                          f'seconds: {advice}')
@@ -96,7 +99,7 @@ def text_seconds(cells: Sequence[str], name: str, dayfirst: bool | None,
         return np.asarray(found.dt.total_seconds(), dtype=np.float64)
     # only texts that look like dates: others could be completed by today's date
     dated = texts.where(texts.map(lambda cell: bool(_DATE.match(cell)))).str.replace(
-        r'(:\d\d),(\d)', r'\1.\2', regex=True)
+        r'(:\d\d:\d\d)(?:,(?=\d)|:(?=\d{3}$))', r'\1.', regex=True)
     match = dated.str.extract(_DAY_AND_MONTH)
     first, second = (pd.to_numeric(match[column]) for column in (0, 2))
     if (first > 12).any() and (second > 12).any():
@@ -124,7 +127,7 @@ def text_seconds(cells: Sequence[str], name: str, dayfirst: bool | None,
             times = times.where(~left, pd.to_datetime(
                 dated[left], format='mixed', dayfirst=bool(dayfirst), errors='coerce', utc=True))
     unread = times.isna() & (texts != '')
-    if unread.sum() > max(1.0, rules.unreadable * len(texts)):
+    if times.isna().all() or unread.sum() > max(1.0, rules.unreadable * len(texts)):
         raise ValueError(wrong.format(texts[int(unread.idxmax())]) + ': write dates as '
                          '2026-01-31 14:00:00, or name another column')
     return np.asarray((times - times.dropna().iloc[0]).dt.total_seconds(), dtype=np.float64)

@@ -79,18 +79,24 @@ MUTATED = ('commas', 'semicolons', '"1,234.5"', '1.234,5', '31.01.2026',
            'InfluxDB', 'TOA5', 'HOBO', 'LabVIEW', 'time, tag, value')
 SPECIAL = ('', 'Bad', '-', 'NaN', '1e400', '9' * 400, '12:00', '#DIV/0!', '0x1F', '"',
            '1,5,5', '-1.#IND', '5.5.5')
+STARTS, COUNTS = re.compile(r'(?<!\d)\d'), re.compile(r'\d|(?<=\d)[.,](?=\d)')
 MARKS = ',;\t"\'.# \x00éT:-/\n\u202f'
 
 
 def mutated(text: str, rng: random.Random) -> str:
-    """Return a table in which something else has changed than digits and their number."""
+    """
+    Return a table in which something has changed.
+
+    Digits, decimal marks and signs stay: nobody can tell that a number was another one.
+    """
     for _ in range(rng.choice([1, 1, 1, 2, 3])):
         lines, at = text.split('\n'), rng.randrange(len(text))
         line = rng.randrange(len(lines))
         kind = rng.randrange(8)
         if kind == 0:
-            text = text[:at] + rng.choice(MARKS) + text[at:]
-        elif kind == 1 and not re.fullmatch(r'.?\d.?|\d[.,]\d', text[max(0, at - 1):at + 2]):
+            marks = MARKS.replace('-', '') if STARTS.match(text, at) else MARKS
+            text = text[:at] + rng.choice(marks) + text[at:]
+        elif kind == 1 and not COUNTS.match(text, at):
             text = text[:at] + text[at + 1:]
         elif kind == 2 and not text[at].isdigit():
             text = text[:at] + rng.choice(MARKS) + text[at + 1:]

@@ -83,6 +83,20 @@ def test_times_of_each_kind_are_seconds_since_the_first_measurement(column, time
     assert levels(frame(**{column: times}), time=name).time == pytest.approx(SECONDS)
 
 
+def test_a_row_for_each_value_may_have_times_of_another_name():
+    table = {'entity': N * ['level', 'pump'], 'changed': np.repeat(SECONDS, 2),
+             'state': np.column_stack([LEVEL, PUMP]).ravel()}
+    episode = levels(table, time='changed [s]')
+    assert episode.time == pytest.approx(SECONDS)
+    assert episode.x[:, 0] == pytest.approx(LEVEL)
+
+
+def test_a_minus_of_typography_is_a_minus():
+    cells = [f'{value - 1.0:.6f}'.replace('-', '\u2212') for value in LEVEL]
+    episode = levels({'time': SECONDS, 'level': cells, 'pump': PUMP})
+    assert episode.x[:, 0] == pytest.approx(LEVEL - 1.0, abs=1e-6)
+
+
 def test_rows_of_another_kind_have_no_time():
     stamps = ['YYYY-MM-DD', *map(str, START + pd.to_timedelta(SECONDS[1:], 's'))]
     assert levels(frame(date=['2026-03-01'] * N, time=stamps)).time == pytest.approx(SECONDS[:-1])
@@ -108,7 +122,11 @@ def test_times_may_be_a_period_a_unit_of_the_argument_or_an_index(options):
     ({'time': SECONDS}, {'time': 'hour'}, "no column 'hour'"),
     ({'time': SECONDS}, {'time': 'time', 'period': 1.0}, 'give one'),
     ({'time': ['noon'] * N}, {}, 'neither numbers nor dates'),
+    ({'time': ['noon', *[''] * (N - 1)]}, {}, 'neither numbers nor dates'),
     ({'time': [np.nan] * N}, {}, 'holds no times'),
+    ({'time': [np.inf] * N}, {}, 'holds no times'),
+    ({'time': SECONDS + 0j}, {}, 'complex'),
+    ({'time': 740013.0 + SECONDS / 86400.0}, {}, 'MATLAB'),
     ({'time [K]': SECONDS}, {}, 'cannot be converted'),
     ({'time': SECONDS, 'level [m]': ['Bad'] * N}, {}, 'holds no number'),
     ({'time': SECONDS, 'level [m]': np.where(SECONDS < 4.0, LEVEL, np.nan)}, {},
@@ -280,7 +298,7 @@ def test_a_period_beside_a_column_of_times_is_a_notice():
     (np.where(np.arange(N) == 7, 24, 192), 1),
     # of other codes, or a signal
     (np.zeros(N), 0), (np.full(N, 200.5), 0)])
-@pytest.mark.parametrize('header', ['level_quality', 'Quality'])
+@pytest.mark.parametrize('header', ['level_quality', 'Quality', 'level QualityDetail'])
 def test_values_that_are_not_good_are_left_out(quality, left_out, header):
     table = frame(time=SECONDS).assign(**{header: quality})
     table.loc[7, 'level [m]'] = 1.2

@@ -42,6 +42,10 @@ def plain(value: float) -> str:
     return f'{value:.2f}'
 
 
+def comma(value: float) -> str:
+    return plain(value).replace('.', ',')
+
+
 def rows(cells: Callable[[int], list[str]], separator: str = ',') -> str:
     return ''.join(separator.join(cells(k)) + '\n' for k in range(N))
 
@@ -72,7 +76,7 @@ HEADER = 'time,level,flow'
 DIALECTS: dict[str, Dialect] = {
     'commas': Dialect(table(HEADER, seconds)),
     'semicolons': Dialect(table(
-        HEADER.replace(',', ';'), seconds, lambda v: plain(v).replace('.', ','), ';')),
+        HEADER.replace(',', ';'), seconds, comma, ';')),
     'tabs': Dialect(table(HEADER.replace(',', '\t'), seconds, plain, '\t'),
                             suffix='.txt', encoding='utf-16'),
     '"1,234.5"': Dialect(table(HEADER, seconds, quoted)),
@@ -96,13 +100,13 @@ DIALECTS: dict[str, Dialect] = {
         HEADER, lambda k: f'{EPOCH[k]}000000')),
     '20260131140000': Dialect(table(HEADER, day('%Y%m%d%H%M%S')), refused='dates without'),
     'serial days': Dialect(table(HEADER, lambda k: f'{SERIAL[k]:.10f}'),
-                                         refused='spreadsheets count'),
+                           refused='spreadsheets or MATLAB count'),
     '31/01/2026': Dialect(table(HEADER, day('%d/%m/%Y %H:%M:%S'))),
     '01/02/2026': Dialect(table(HEADER, lambda k: (
         DATES[k] + timedelta(days=2)).strftime('%d/%m/%Y %H:%M:%S')), refused='dayfirst'),
     '31.01.2026': Dialect(table(
         HEADER.replace(',', ';'), day('%d.%m.%Y %H:%M:%S'),
-        lambda v: plain(v).replace('.', ','), ';')),
+        comma, ';')),
     'time, tag, value': Dialect('time,tag,value\n' + rows(
         lambda k: [seconds(k), f'level,{plain(LEVEL[k])}\n{seconds(k)},flow', plain(FLOW[k])])),
     'InfluxDB': Dialect(
@@ -122,11 +126,32 @@ DIALECTS: dict[str, Dialect] = {
                           plain(LEVEL[k]), plain(FLOW[k])]),
         states='level = Level, mm (LGR S/N: 7) [mm]', inputs='flow = Flow, L/h [L/h]'),
     'LabVIEW': Dialect(
-        'LabVIEW Measurement\t\nWriter_Version\t2\nSeparator\tTab\n***End_of_Header***\t\n\t\t\t\n'
-        'Channels\t2\t\t\nSamples\t80\t80\t\n***End_of_Header***\t\t\t\n'
+        'LabVIEW Measurement\t\nWriter_Version\t2\nReader_Version\t2\nSeparator\tTab\n'
+        'Date\t2026/01/30\n***End_of_Header***\t\n\t\t\t\nChannels\t2\t\nSamples\t80\t80\nX_Dimension\tTime\tTime\n'
+        'X0\t0.0\t0.0\nDelta_X\t20.0\t20.0\n***End_of_Header***\n'
         'X_Value\tlevel\tflow\tComment\n' + rows(
-            lambda k: [f'{SECONDS[k]:.6f}', plain(LEVEL[k]), plain(FLOW[k]), ''], '\t'),
+            lambda k: [f'{SECONDS[k]:.6f}', plain(LEVEL[k]), plain(FLOW[k])], '\t'),
         suffix='.lvm'),
+    'PI': Dialect('Tag,Timestamp,Value\n' + rows(
+        lambda k: [f'level,{day("%d-%b-%Y %H:%M:%S")(k)}', f'{plain(LEVEL[k])}\nflow',
+                   day('%d-%b-%Y %H:%M:%S')(k), plain(FLOW[k])])),
+    'Wonderware': Dialect('DateTime,TagName,Value,Quality,QualityDetail\n' + rows(
+        # one value of 0 before another one is not good
+        lambda k: ['\n'.join(f'{DATES[k]}.0000000,{cells}' for cells in [
+            *['level,0.0,1,24'] * (k == 40), f'level,{plain(LEVEL[k])},0,192',
+            f'flow,{plain(FLOW[k])},0,192'])])),
+    'WinCC': Dialect(
+        '"VarName";"TimeString";"VarValue";"Validity";"Time_ms"\n' + ''.join(
+            f'"{name}";"{day("%d.%m.%Y %H:%M:%S")(k)}";{comma(value)};1;{comma(1e6 * SERIAL[k])}\n'
+            for k in range(N) for name, value in [('level', LEVEL[k]), ('flow', FLOW[k])])
+        + f'"$RT_OFF$";"{day("%d.%m.%Y %H:%M:%S")(-1)}";0;2;{comma(1e6 * SERIAL[-1])}\n'),
+    'BenchLink': Dialect(
+        'Name:,tank\nOwner:,me\nChannel,Name,Function\n101,level,DC\n102,flow,DC\nScan Control:\n'
+        'Interval:,20\n\nScan,Time,level (mm),Alarm 101,flow (L/h),Alarm 102\n' + rows(
+            lambda k: [str(k + 1), day('%m/%d/%Y %H:%M:%S:000')(k), plain(LEVEL[k]), '0',
+                       plain(FLOW[k]), '0']), encoding='utf-16'),
+    'Date, Time': Dialect('Date,Time,level,flow\n' + rows(
+        lambda k: [day('%Y/%m/%d')(k), day('%H:%M:%S')(k), plain(LEVEL[k]), plain(FLOW[k])])),
     'level [m], level [mm]': Dialect(table(
         'time,level [mm],level [m]', seconds), inputs='level2 = level [m]', refused='2 columns'),
     'equal headers': Dialect(table('time,level,level', seconds), inputs='level2 = level',
