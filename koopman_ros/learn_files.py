@@ -5,11 +5,13 @@
 Learn a model of a plant from files of measurements, without ROS.
 
 The model is written with a report. Exit code: 0 for an accepted model, 2 for a rejected one, 1 for
-an error.
+an error, 130 after an interrupt, which keeps the best model so far.
 """
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+import shlex
 import sys
 from typing import Any
 
@@ -109,9 +111,13 @@ def command_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _next(file: str, accepted: bool) -> str:
+def _next(summary: Mapping[str, Any]) -> str:
     """Return the next steps in words."""
-    if not accepted:
+    file = summary['model_file']
+    if summary['accepted'] is None:
+        return (f'--model_class {shlex.quote(summary["model_class"])} learns and judges this '
+                'class alone')
+    if not summary['accepted']:
         return ('change the record or the options as the reasons say; '
                 'docs/how-to/tune_training.md explains each')
     return (f"control by load('{file}') in Python (docs/tutorials/without_ros.md) or by the node "
@@ -164,7 +170,7 @@ def _points(texts: Sequence[str]) -> dict[str, tuple[float, ...]]:
 def _learned(options: Mapping[str, Any], present: LiftedModel | None, record: Record, n_u: int,
              test: Record | None) -> int:
     # not before it is clear that there is something to learn: torch takes seconds
-    from koopman_ros.learning import learn
+    from koopman_ros.learning import Interrupted, learn
     from koopman_ros.learning.report import reported
 
     about = record.plant
@@ -182,27 +188,44 @@ def _learned(options: Mapping[str, Any], present: LiftedModel | None, record: Re
         raise ValueError(reason)
     progress = TrainingProgress(lambda text: print(text, file=sys.stderr, flush=True))
 
+    now = JobState()
+
     def on_progress(share: float, text: str) -> bool:
-        progress.show(JobState(share, text))
+        nonlocal now
+        now = JobState(share, text)
+        progress.show(now)
         return False
 
-    result = learn(record, test=test, on_progress=on_progress, **{
-        **settings.training(signals), 'lag': _seconds('lag', options['lag']),
-        'dead_time': _seconds('dead_time', options['dead_time']),
-        'characteristics': _points(options['characteristic']),
-        'as_state': tuple(options['as_state']), 'output': settings.model_output,
-        **{name: str(model_path(file)) for name in ('model', 'warm_start_model')
-           if (file := getattr(settings, name))}})
+    try:
+        result = learn(record, test=test, on_progress=on_progress, **{
+            **settings.training(signals), 'lag': _seconds('lag', options['lag']),
+            'dead_time': _seconds('dead_time', options['dead_time']),
+            'characteristics': _points(options['characteristic']),
+            'as_state': tuple(options['as_state']), 'output': settings.model_output,
+            **{name: str(model_path(file)) for name in ('model', 'warm_start_model')
+               if (file := getattr(settings, name))}})
+    except Interrupted as interrupt:
+        progress.show(replace(now, ended=True))
+        if interrupt.result is not None:
+            summary: Mapping[str, Any] = interrupt.result.summary()
+            print(printed(outcome_text(summary)))
+            _print_classes(summary)
+            print(f'next: {_next(summary)}', flush=True)
+        raise
     progress.show(JobState(1.0, ended=True))
     summary, files = reported(result)
     print(printed(outcome_text(summary)))
-    for name, line in {**class_lines(summary), **constant_lines(summary)}.items():
-        print(printed(f'{name}: {line}'))
+    _print_classes(summary)
     for warning in summary['warnings']:
         print(f'warning: {printed(warning)}')
     for name, run in result.free_runs.items():
         print(printed(f'{name}: {run}'))
     print('report: ' + ', '.join(files))
-    print(f'{summary["found"]}: {"accepted" if result.accepted else "rejected"}')
-    print(f'next: {_next(summary["model_file"], result.accepted)}')
+    print(f'{summary["found"]}: {result.verdict}')
+    print(f'next: {_next(summary)}')
     return 0 if result.accepted else 2
+
+
+def _print_classes(summary: Mapping[str, Any]) -> None:
+    for name, line in {**class_lines(summary), **constant_lines(summary)}.items():
+        print(printed(f'{name}: {line}'))

@@ -177,7 +177,7 @@ trainer = partial(run_program, 'koopman_ros.nodes.trainer', 0)
 player = partial(run_program, 'koopman_ros.nodes.player', 0)
 replay = partial(run_program, 'koopman_ros.nodes.replay', 130)
 panel = partial(run_program, 'koopman_ros.nodes.panel', 0)
-learn = partial(run_program, 'koopman_ros.learn_files', 130, 0.3)
+learn = partial(run_program, 'koopman_ros.learn_files', 130, 0.5)
 export_c = partial(run_program, 'koopman_ros.export.command_line', 130)
 command_line = partial(run_program, 'koopman_ros.ros.command_line', 130)
 

@@ -233,6 +233,51 @@ def test_the_module_is_the_program(tmp_path):
     assert found.stderr.startswith('learn: the signals are not known: give --states and --inputs')
 
 
+# The program, whose estimates are few and whose closed loops are four.
+QUICK = f"""
+import sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from support.quick_retraining import quick_retraining
+from koopman_ros import process_entry
+with quick_retraining(4, degrees=(1, 2)):
+    sys.exit(process_entry.learn())
+"""
+
+
+@pytest.mark.parametrize(('number', 'event', 'kept'), [
+    (signal.SIGINT, b'judging: polynomial', 'linear'),
+    (signal.SIGTERM, b'learning: neural drift', 'polynomial')])
+def test_a_class_that_is_learned_outlives_a_signal(tmp_path, number, event, kept):
+    rng = np.random.default_rng(0)
+    pump, level = np.repeat(rng.uniform(1.0, 9.0, N // 10), 10), [2.0]
+    for value in pump[:N - 1]:
+        for _ in range(10):
+            level.append(level[-1] + 0.1 * PERIOD * (0.1 * value - 0.1 * level[-1] ** 2))
+    pd.DataFrame({'time [s]': PERIOD * np.arange(N), 'pump [V]': pump,
+                  'level [m]': level[::10] + 1e-3 * rng.standard_normal(N)}
+                 ).to_csv(tmp_path / 'day.csv', index=False)
+    own, other = os.openpty()
+    with subprocess.Popen(
+            [sys.executable, '-c', QUICK, 'day.csv', '--states', 'level', '--inputs', 'pump',
+             '--dead_time', 'pump=0', '--unmeasured_states', '0'], cwd=tmp_path,
+            stdout=subprocess.PIPE, stderr=other, text=True) as process:
+        os.close(other)
+        terminal = b''
+        while event not in terminal:
+            terminal += os.read(own, 4096)
+        process.send_signal(number)
+        said, _ = process.communicate(timeout=60.0)
+    os.close(own)
+    assert process.returncode == 130
+    assert {path.name for path in tmp_path.iterdir()} == {'day.csv', *(
+        f'day.unfinished.{ending}' for ending in ('json', 'md', 'safetensors'))}
+    model = load(tmp_path / 'day.unfinished.safetensors')
+    assert (model.provenance.model_class, model.provenance.accepted) == (kept, False)
+    assert 'classes not tried' in (tmp_path / 'day.unfinished.md').read_text()
+    assert f'({kept}) is kept as day.unfinished.safetensors' in said
+    assert f'next: --model_class {kept}' in said
+
+
 def test_a_training_ends_by_a_signal(folder):
     arguments = ['learn', 'day.csv', '--states', 'level', '--inputs', 'pump']
     with subprocess.Popen([sys.executable, '-m', 'koopman_ros', *arguments],

@@ -18,7 +18,7 @@ from koopman_ros.core.progress import show_bar
 from koopman_ros.core.units import difference_text
 from koopman_ros.execution.job import Job
 
-_CANCELLED = 'cancelled; nothing was written'
+_CANCELLED = 'cancelled'
 _LINE_PERIOD = 5.0  # s between plain lines of progress
 
 
@@ -44,7 +44,7 @@ class JobState:
     @property
     def cancelled(self) -> bool:
         """Whether it has ended because that was requested."""
-        return self.text == _CANCELLED
+        return self.text.startswith(_CANCELLED)
 
 
 class TrainingProgress:
@@ -96,7 +96,7 @@ class TrainingJob(Job):
         return self.state
 
     def cancel(self) -> None:
-        """Request the end of the process; nothing is written then."""
+        """Request the end of the process, which keeps the best model so far."""
         self._cancelled = True
         super().cancel()
 
@@ -112,14 +112,15 @@ class TrainingJob(Job):
         if 'summary' in message:
             return JobState(1.0, outcome_text(message['summary']), True, message['summary'])
         if 'stopped' in message:
-            return JobState(self.state.share, _CANCELLED, True)
+            return JobState(self.state.share, f'{_CANCELLED}; {message["stopped"]}', True)
         return JobState(self.state.share, f'training failed: {message["error"]}', True)
 
     def _ended(self) -> JobState:
         """Return the state of a process that ended without a last line."""
         code = self.process.wait()
         if self._cancelled:
-            text = _CANCELLED
+            # by force it may have ended later
+            text = _CANCELLED if code < 0 else f'{_CANCELLED}; nothing was written'
         elif code < 0:
             name = next((s.name for s in signal.Signals if s == -code), f'signal {-code}')
             remedy = ('the limit is one day of processor time; train on fewer bags'
@@ -137,6 +138,9 @@ class TrainingJob(Job):
 
 def outcome_text(summary: Mapping[str, Any]) -> str:
     """Return the result of a training in a sentence."""
+    if summary['accepted'] is None:
+        return (f'the best model so far ({summary["model_class"]}) is kept as '
+                f'{summary["model_file"]}: {"; ".join(summary["reasons"])}')
     if not summary['accepted']:
         reasons = '; '.join(summary['reasons'])
         kept = f'; saved as {summary["model_file"]}' if summary['model_file'] else ''

@@ -29,6 +29,7 @@ from koopman_ros.learning.pipeline import retrain
 from koopman_ros.learning.report import write_report
 from koopman_ros.learning.task import TrainingTask
 from koopman_ros.learning.training_result import TrainingResult
+from koopman_ros.learning.unfinished import Interrupted
 
 __all__ = [
     'AcceptanceResult',
@@ -38,6 +39,7 @@ __all__ = [
     'Fit',
     'FreeRun',
     'IncrementalTraining',
+    'Interrupted',
     'Judge',
     'LiftMetrics',
     'Linearisation',

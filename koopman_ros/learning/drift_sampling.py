@@ -178,7 +178,9 @@ def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thre
                     watch: Watch | None = None,
                     judging: Callable[[str, float], bool] = lambda *_: False,
                     device: str = 'cpu', backend: Backend | None = None,
-                    begin: LiftedModel | None = None) -> ClassComparison:
+                    begin: LiftedModel | None = None,
+                    on_class: Callable[[ClassComparison], None] = lambda _: None
+                    ) -> ClassComparison:
     """
     Learn models of an estimated drift as :func:`learning.compare` does, judged by the record.
 
@@ -193,6 +195,7 @@ def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thre
     :param judging: called with the class whose law is being tried and the share that is done.
     :param device: as for :func:`learning.train`, like `begin`, and `backend`, where closed loops
         run, too.
+    :param on_class: as for :func:`learning.compare`.
     :raises TrainingFailed: when no model of the requested class was learned, or none at all.
     :raises ValueError: when the episodes hold no steady state, and for an unknown class.
     :raises Stopped: when `judging` ended it.
@@ -225,4 +228,4 @@ def compare_classes(found: Identified, plant: PlantDescription, thresholds: Thre
     return compare(known, samples, recipes, budget=BUDGET / (1 if alone else len(recipes)),
                    choose=model_class if alone else None, alone=alone, seed=seed, starts=starts,
                    watch=watch, judge=Judge(judged, max(chance, ROUNDING)), device=device,
-                   backend=backend, begin=begin)
+                   backend=backend, begin=begin, on_class=on_class)

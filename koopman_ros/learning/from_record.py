@@ -46,10 +46,12 @@ def learn(record: Record, *, test: Record | None = None, disturbances: Sequence[
     :param dead_time: of inputs by name, in s; of those not named it is found.
     :param model_class: to learn, e.g. ``'linear'``; by default the one that the rule selects.
     :param seed: of the split and of the training.
-    :param on_progress: called with the share done and a text; True stops the training.
+    :param on_progress: called with the share done and a text; True stops the training, which
+        returns the best of the classes learned so far, or raises `Stopped` before the first.
     :param settings: further fields of :class:`TrainingTask`, e.g. ``lag`` or ``physical_model``.
     :raises TypeError: for an unknown setting, or a record that is none.
     :raises ValueError: for a record that does not determine a model, or settings that do not fit.
+    :raises KeyboardInterrupt: at Ctrl-C; its `result` has the best of the classes learned so far.
     """
     expect(record=(record, Record))
     if test is not None:

@@ -18,6 +18,7 @@ from koopman_ros.core.datasets import DriftSamples, PlantDescription
 from koopman_ros.core.plots import table
 from koopman_ros.evaluation.closed_loop_test import ClosedLoopTest, evaluate_closed_loops, LOOPS
 from koopman_ros.execution import Backend
+from koopman_ros.learning.identification import Stopped
 from koopman_ros.learning.lift.edmd import Edmd
 from koopman_ros.learning.lift.incremental import IncrementalTraining
 from koopman_ros.learning.lift.levenberg_marquardt import MinimumStatus
@@ -74,6 +75,7 @@ class ClassComparison:
     chosen: ModelCandidate  #: selected by the rule, or named by the user
     state_names: tuple[str, ...]  #: of the states, with their units
     state_units: tuple[str, ...]
+    untried: tuple[str, ...] = ()  #: the classes that are still to be learned
 
     _repr_pretty_ = show_printed
 
@@ -136,7 +138,8 @@ def compare(plant: PlantDescription, samples: DriftSamples,
             seed: int = 0, starts: int = 2, watch: Watch | None = None,
             loops: int = LOOPS, judge: Judge | None = None, device: str = 'cpu',
             backend: Backend | None = None, begin: LiftedModel | None = None,
-            budget: float = math.inf) -> ClassComparison:
+            budget: float = math.inf,
+            on_class: Callable[[ClassComparison], None] = lambda _: None) -> ClassComparison:
     """
     Learn a model of each class from the same episodes and choose one by a stated rule.
 
@@ -156,9 +159,12 @@ def compare(plant: PlantDescription, samples: DriftSamples,
     :param judge: of the models, in place of validation episodes and `loops`.
     :param begin: as in :func:`train`, for the lifts of its kind, of which one has to be learned.
     :param budget: processor time in s of the networks of each class, see :func:`train`.
+    :param on_class: called after each class with the comparison so far, once there is a model.
     :raises TrainingFailed: when no model of the requested class was learned, or none at all.
     :raises ValueError: for an unknown name; otherwise as :func:`train`, where the class was
         requested or the cause is in the samples.
+    :raises Stopped: when `watch` requested it.
+    :raises KeyboardInterrupt: at an interrupt from the keyboard.
     """
     expect(plant=(plant, PlantDescription), samples=(samples, DriftSamples))
     n_x = samples.x.shape[1]
@@ -181,6 +187,13 @@ def compare(plant: PlantDescription, samples: DriftSamples,
     counts = {name: starts * _rounds(recipes[name], n_x) for name in names if name in recipes}
     found: list[ModelCandidate] = []
     drift: LiftedModel | None = None
+
+    def so_far() -> ClassComparison:
+        named = next((one for one in found if one.name == choose), None)
+        return ClassComparison(
+            tuple(found), named or plainest(found, judge.resolution), plant.state_names,
+            plant.state_units, names[len(found):])
+
     for name in names:
         since, steps, limit = time.perf_counter(), 0, ''
         try:
@@ -190,6 +203,9 @@ def compare(plant: PlantDescription, samples: DriftSamples,
                     loops=0, watch=_among(watch, name, counts),
                     device=device, backend=backend,
                     begin=begin if name in continuing else None, budget=budget)
+                if trained.status == MinimumStatus.INTERRUPTED.value:
+                    # from the keyboard: a start cut short is no model to compare
+                    raise KeyboardInterrupt
                 steps = trained.steps
                 if trained.status == MinimumStatus.OUT_OF_TIME.value:
                     limit = trained.status
@@ -210,8 +226,9 @@ def compare(plant: PlantDescription, samples: DriftSamples,
                 raise
             found.append(ModelCandidate(name, None, math.inf, None, None,
                                         time.perf_counter() - since, str(rejection)))
-    chosen = plainest(found, judge.resolution) if choose is None else found[names.index(choose)]
-    return ClassComparison(tuple(found), chosen, plant.state_names, plant.state_units)
+        if any(one.model is not None for one in found):
+            on_class(so_far())
+    return so_far()
 
 
 def plainest(contenders: Sequence[ModelCandidate], resolution: float = ROUNDING) -> ModelCandidate:
@@ -248,14 +265,16 @@ def _rounds(recipe: Recipe, n_x: int) -> int:
 
 
 def _among(watch: Watch | None, name: str, counts: Mapping[str, int]) -> Watch | None:
-    """Return a watch that counts the starts of one class among those of all."""
+    """Return a watch that counts the starts of one class among those of all, and ends all."""
     if watch is None:
         return None
     before = sum(counts[other] for other in list(counts)[:list(counts).index(name)])
 
     def on_progress(now: MultistartProgress) -> bool:
-        return watch(replace(now, name=name, finished=before + now.finished,
-                             total=sum(counts.values())))
+        if watch(replace(now, name=name, finished=before + now.finished,
+                         total=sum(counts.values()))):
+            raise Stopped
+        return False
 
     return on_progress
 

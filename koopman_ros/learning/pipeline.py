@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 import glob
 import hashlib
@@ -34,6 +34,7 @@ from koopman_ros.learning.free_run import AnyModel, FREE_RUN, FreeRun, simulate
 from koopman_ros.learning.identification import (
     Identified,
     methods_of,
+    Stopped,
 )
 from koopman_ros.learning.lift.scaling import checked_device
 from koopman_ros.learning.lift.training import TrainingFailed
@@ -42,6 +43,7 @@ from koopman_ros.learning.pipeline_progress import JUDGED, OnProgress, PipelineP
 from koopman_ros.learning.record import read_record, RecordSource, reduced, TrainingRecord
 from koopman_ros.learning.task import resolve_signals, TrainingTask
 from koopman_ros.learning.training_result import TrainingResult
+from koopman_ros.learning.unfinished import Interrupted, UnfinishedTraining
 from koopman_ros.model import LiftedModel, load, save
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT, SAME
 from koopman_ros.records import Record, RecordedInput, RecordedState
@@ -62,30 +64,43 @@ def retrain(task: TrainingTask, on_progress: OnProgress | None = None, *,
     An accepted lift goes to the output file; the file that it replaces is kept as
     ``.previous.safetensors``. A rejected lift goes to ``.rejected.safetensors``. If the lift that
     training makes of a sibling's would be rejected, training starts again without the sibling.
+    An interrupted training keeps its best model so far as ``.unfinished.safetensors``.
     The result does not depend on the executor of the task.
 
-    :param on_progress: called with the share done and a text; True stops the training. By default
-        a terminal shows both on one line.
+    :param on_progress: called with the share done and a text; True stops the training, which
+        returns the result so far. By default a terminal shows both on one line.
     :param record: to learn from, in place of the bags of the task.
     :param test: a record that takes no part in the training. The new model is rejected if its free
         run errs more there than that of the best linear model.
     :raises BagReadError: for bags that cannot be used.
     :raises ModelFileError: when the current or the initial model cannot be read.
     :raises ValueError: for episodes that do not determine a model, or a task that does not fit.
-    :raises Stopped: when `on_progress` returned True; nothing is written.
-    :raises WorkerLost: when workers are lost and none takes over; nothing is written then.
-    :raises SchedulerLost: when a scheduler is not reached, or lost; nothing is written then.
+    :raises Stopped: when `on_progress` returned True before a class was learned.
+    :raises Interrupted: at Ctrl-C, with the result so far.
+    :raises WorkerLost: when workers are lost and none takes over.
+    :raises SchedulerLost: when a scheduler is not reached, or lost.
     """
     checked_device(task.device)
-    # a drift that diverges is found by its values
-    with (np.errstate(all='ignore'), backend_of(task.executor) as backend,
-          progress_line() as report):
-        return _retrain(backend, task, on_progress or (lambda *now: bool(report(*now))), record,
-                        test)
+    unfinished = UnfinishedTraining()
+    try:
+        # a drift that diverges is found by its values
+        with (np.errstate(all='ignore'), backend_of(task.executor) as backend,
+              progress_line() as report):
+            result = _retrain(backend, task, on_progress or (lambda *now: bool(report(*now))),
+                              record, test, unfinished)
+    except Stopped:
+        if unfinished.result is None:
+            raise
+        return unfinished.result
+    except KeyboardInterrupt as interrupt:
+        raise Interrupted(unfinished.result) from interrupt
+    unfinished.discard()
+    return result
 
 
 def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
-             given: Record | None, test: Record | None) -> TrainingResult:
+             given: Record | None, test: Record | None, unfinished: UnfinishedTraining
+             ) -> TrainingResult:
     progress, thresholds = PipelineProgress(on_progress), _checked(task)
     current, sibling = (load(path).joined if path else None
                         for path in (task.model, task.warm_start_model))
@@ -128,7 +143,15 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
         plant = replace(current.plant, B=None, disturbance_names=plant.disturbance_names)
     bare = TrainingResult(task, record.account, found, None, None, (), coverage(episodes, box),
                      plant, current, reduction=record.reduction)
-    learned, decision, reasons = _learn(bare, sibling, thresholds, progress, backend)
+
+    def on_class(learned: ClassComparison) -> None:
+        others = f'; classes not tried: {", ".join(learned.untried)}' * bool(learned.untried)
+        reasons = 'the training was interrupted before the acceptance test' + others,
+        model = _with_origin(replace(learned.model, dead_time=dead_time), found, episodes,
+                             learned.chosen.name, reasons).with_disturbances(task.disturbances)
+        unfinished.keep(replace(bare, learned=learned.with_model(model), reasons=reasons))
+
+    learned, decision, reasons = _learn(bare, sibling, thresholds, progress, backend, on_class)
     if learned is None or decision is None:
         return replace(bare, reasons=reasons)
     learned = learned.with_model(replace(learned.model, dead_time=dead_time))
@@ -147,9 +170,10 @@ def _retrain(backend: Backend, task: TrainingTask, on_progress: OnProgress,
         *[f'not compared with the current model {task.model}, which has other states'
           ] * bool(task.model and current is None)))
     progress('decide', WRITING, 'writing')
-    model = _with_provenance(learned.model, found, decision, min(bare.coverage.values()),
-                             episodes, learned.chosen.name, runs['record']
-                             ).with_disturbances(task.disturbances)
+    model = _with_figures(
+        _with_origin(learned.model, found, episodes, learned.chosen.name, decision.reasons),
+        decision, min(bare.coverage.values()), episodes, runs['record']
+    ).with_disturbances(task.disturbances)
     result = replace(bare, learned=learned.with_model(model), decision=decision,
                      reasons=decision.reasons, free_runs=runs, compared_runs=others)
     if not task.output:
@@ -231,7 +255,8 @@ def _checked(task: TrainingTask) -> Thresholds:
 
 
 def _learn(bare: TrainingResult, sibling: LiftedModel | None, thresholds: Thresholds,
-           progress: PipelineProgress, backend: Backend
+           progress: PipelineProgress, backend: Backend,
+           on_class: Callable[[ClassComparison], None]
            ) -> tuple[ClassComparison | None, AcceptanceResult | None, tuple[str, ...]]:
     """Return the classes, the decision, and the reasons of a rejection; from a sibling first."""
     task, found = bare.task, bare.found
@@ -245,7 +270,7 @@ def _learn(bare: TrainingResult, sibling: LiftedModel | None, thresholds: Thresh
                 found, bare.plant, thresholds, model_class=task.model_class,
                 n_z=task.coordinates or 2 + len(found.drift.box.states), seed=task.seed,
                 starts=task.starts, watch=progress.learning, judging=progress.judging,
-                device=task.device, backend=backend, begin=begin)
+                device=task.device, backend=backend, begin=begin, on_class=on_class)
         except TrainingFailed as error:
             reasons: tuple[str, ...] = (str(error),)
         progress('decide', JUDGED, 'judging')
@@ -262,14 +287,23 @@ def _learn(bare: TrainingResult, sibling: LiftedModel | None, thresholds: Thresh
     return learned, decision, reasons
 
 
-def _with_provenance(model: LiftedModel, found: Identified, decision: AcceptanceResult,
-                     covered: float, episodes: list[Episode], model_class: str, run: FreeRun
-                     ) -> LiftedModel:
+def _with_origin(model: LiftedModel, found: Identified, episodes: Sequence[Episode],
+                 model_class: str, reasons: tuple[str, ...]) -> LiftedModel:
+    """Return a model with its record, its class and its verdict."""
     sha = hashlib.sha256()
     for episode in episodes:
         for array in (episode.time, episode.x, episode.input_time, episode.u):
             sha.update(np.ascontiguousarray(array).astype('<f8').tobytes())
         sha.update(bytes(episode.linear))
+    measured = model.states.names[:len(model.states) - found.hidden] if found.hidden else ()
+    return replace(model, states_measured=measured, provenance=replace(
+        model.provenance, data_digest=sha.hexdigest(), model_class=model_class,
+        method=f'{found.method}, {found.drift.form}', accepted=not reasons, reasons=reasons))
+
+
+def _with_figures(model: LiftedModel, decision: AcceptanceResult, covered: float,
+                  episodes: Sequence[Episode], run: FreeRun) -> LiftedModel:
+    """Return a model with the figures of its acceptance."""
     metrics = {**model.provenance.metrics, 'coverage': covered,
                'sample_interval': sample_interval(episodes) * model.seconds_per_time_unit}
     for label, values in (('rollout_rmse', decision.rmse), ('noise', decision.noise)):
@@ -280,14 +314,10 @@ def _with_provenance(model: LiftedModel, found: Identified, decision: Acceptance
                 for name, error in zip(run.names, run.rmse, strict=True)}
     # a rejected lift may diverge
     metrics = {name: value for name, value in metrics.items() if np.isfinite(value)}
-    measured = model.states.names[:len(model.states) - found.hidden] if found.hidden else ()
-    origin = replace(
-        model.provenance, data_digest=sha.hexdigest(), metrics=metrics,
-        method=f'{found.method}, {found.drift.form}', model_class=model_class,
-        accepted=decision.accepted, reasons=decision.reasons, closed_loops=decision.statement)
-    return replace(model, verified_loops=decision.law_check.tried, states_measured=measured,
+    return replace(model, verified_loops=decision.law_check.tried,
                    rate_band=None if decision.plant is None else decision.plant.band,
-                   provenance=origin)
+                   provenance=replace(model.provenance, metrics=metrics,
+                                      closed_loops=decision.statement))
 
 
 def _place(output: Path, accepted: bool) -> Path:

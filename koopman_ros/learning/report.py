@@ -31,27 +31,27 @@ from koopman_ros.model import Coordinates, RateBand
 from koopman_ros.model_classes import BEST
 
 
-def write_report(retrained: TrainingResult) -> list[Path]:
+def write_report(retrained: TrainingResult, *, pictures: bool = True) -> list[Path]:
     """
     Write ``<output>.json``, ``.md`` and, with matplotlib, pictures; return the files.
 
     The pictures are ``.png``, and ``.free_run.png`` and ``.test.png`` of free runs.
     """
     base = Path(retrained.task.output)
-    pictures = {'Data, drift and prediction': base.with_suffix('.png')}
-    drawn = _draw(pictures['Data, drift and prediction'], retrained)
+    files = {'Data, drift and prediction': base.with_suffix('.png')}
+    drawn = pictures and _draw(files['Data, drift and prediction'], retrained)
     for name, run in retrained.free_runs.items() if drawn else ():
         path = base.with_suffix('.free_run.png' if name == 'record' else f'.{name}.png')
         title = f'Free run on the {name} {run.plant.name}'.replace('test', 'test record', 1)
-        run.draw(path, f'{title}: the new model is {_verdict(retrained)}')
-        pictures[title] = path
+        run.draw(path, f'{title}: the new model is {retrained.verdict}')
+        files[title] = path
     written = [write_figures(base.with_suffix('.json'), retrained.summary()),
                write_page(base.with_suffix('.md'), _title(retrained),
                           [*_sections(retrained),
-                           *(f'![{title}]({path.name})' for title, path in pictures.items()
+                           *(f'![{title}]({path.name})' for title, path in files.items()
                              if drawn)],
                           ('numpy', 'scipy', 'torch'))]
-    return [*written, *(pictures.values() if drawn else [])]
+    return [*written, *(files.values() if drawn else [])]
 
 
 def reported(retrained: TrainingResult) -> tuple[dict[str, Any], tuple[str, ...]]:
@@ -64,10 +64,6 @@ def reported(retrained: TrainingResult) -> tuple[dict[str, Any], tuple[str, ...]
         # the lift is written already
         warnings.append(f'the report could not be written: {error}')
     return {**retrained.summary(), 'warnings': warnings}, files
-
-
-def _verdict(retrained: TrainingResult) -> str:
-    return 'accepted' if retrained.accepted else 'rejected'
 
 
 def _title(retrained: TrainingResult) -> str:
@@ -84,7 +80,7 @@ def _sections(retrained: TrainingResult) -> Iterator[str]:
     errors = tuple(f'error of {name} [{unit}]'
                    for name, unit in zip(states.names, states.units, strict=True))
     kind = '' if learned is None else f' ({learned.model.kind})'
-    yield f'**The new model{kind} is {_verdict(retrained)}.**'
+    yield f'**The new model{kind} is {retrained.verdict}.**'
     yield bullets([*retrained.reasons, *(f'Warning: {one}.' for one in retrained.warnings)])
     if retrained.model_file:
         yield f'Model file: `{retrained.model_file}`'
@@ -131,7 +127,7 @@ def _sections(retrained: TrainingResult) -> Iterator[str]:
                   *[''] * (len(states) - len(score.rmse)))
                  for score in found.scores), range(2, 2 + len(states)))
     yield bullets(found.steps)
-    if decision is None or learned is None:
+    if learned is None:
         return
     yield '## Classes of models'
     by_rule = retrained.task.model_class == BEST
@@ -142,6 +138,8 @@ def _sections(retrained: TrainingResult) -> Iterator[str]:
     yield ('rx is the relative mean-square difference from the estimated drift; roll-outs are '
            'simulations of the held-out measurements, including their noise; errors beyond the '
            'noise are mean squares relative to the range.')
+    if decision is None:
+        return
     yield '## On held-out segments'
     yield 'Root mean square errors of predictions of the measurements:'
     yield table(('prediction by', *errors),
@@ -219,7 +217,7 @@ def _draw(path: Path, retrained: TrainingResult) -> bool:
                     low, high = row[3].get_ylim()
                     row[3].set_ylim(low, high + 0.2 * (high - low))  # room for the legend
                     row[3].legend(fontsize=8, loc='upper left')
-            figure.suptitle(f'{_title(retrained)}: the new model is {_verdict(retrained)}')
+            figure.suptitle(f'{_title(retrained)}: the new model is {retrained.verdict}')
     except ImportError:
         return False
     return True

@@ -5,8 +5,9 @@
 The process that retrains: a task in JSON on the first line of its input, JSON lines on its output.
 
 Each line holds either ``progress`` (share done) with ``text``, or at last ``summary`` and
-``files``, or ``error``, or ``stopped``. It ends early on SIGINT, on SIGTERM, and when its input is
-closed, so that it does not outlive the process that started it.
+``files``, or ``error``, or ``stopped`` with the file of the best model so far. It ends early on
+SIGINT, on SIGTERM, and when its input is closed, so that it does not outlive the process that
+started it.
 """
 
 import json
@@ -17,6 +18,7 @@ import threading
 import time
 
 from koopman_ros.execution import SchedulerLost, WorkerLost
+from koopman_ros.execution.training import outcome_text
 from koopman_ros.learning import retrain, TrainingTask
 from koopman_ros.learning.identification import Stopped
 from koopman_ros.learning.report import reported
@@ -46,12 +48,16 @@ def main() -> int:
         return stop.is_set()
 
     try:
-        summary, files = reported(retrain(TrainingTask.of(json.loads(line)), throttled))
+        result = retrain(TrainingTask.of(json.loads(line)), throttled)
+        if result.verdict == 'unfinished':
+            _print(stopped=outcome_text(result.summary()))
+            return 1
+        summary, files = reported(result)
     except BrokenPipeError:
         # the process that started it is gone
         return 1
     except Stopped:
-        _print(stopped=True)
+        _print(stopped='nothing was written')
         return 1
     except _EXPECTED as error:
         _print(error=_error_text(error))

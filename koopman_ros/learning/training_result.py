@@ -76,8 +76,7 @@ class TrainingResult:
     def __str__(self) -> str:
         """Show the structure, the verdict, the free runs and the warnings."""
         return '\n'.join([
-            f'{self.task.plant}: {self.found_text}: '
-            + ('accepted' if self.accepted else 'rejected'),
+            f'{self.task.plant}: {self.found_text}: {self.verdict}',
             *(f'reason: {one}' for one in self.reasons),
             *(f'{name}: {run}' for name, run in self.free_runs.items()),
             *filter(None, [self.decision.statement if self.decision else '']),
@@ -135,6 +134,17 @@ class TrainingResult:
         return not self.reasons
 
     @property
+    def verdict(self) -> str:
+        """``'accepted'``, ``'rejected'``, or ``'unfinished'`` after an interrupt."""
+        return 'accepted' if self.accepted else (
+            'unfinished' if self.learned and self.decision is None else 'rejected')
+
+    @property
+    def model_class(self) -> str:
+        """The class of the model."""
+        return 'none learned' if self.learned is None else self.learned.chosen.name
+
+    @property
     def dead_time(self) -> Array:
         """Dead times (n_u,) of the inputs, in s."""
         return SECONDS_PER_TIME_UNIT[self.plant.time_unit] * self.found.dead_time
@@ -149,7 +159,11 @@ class TrainingResult:
         return SECONDS_PER_TIME_UNIT[self.plant.time_unit] * drift.lag * own
 
     def summary(self) -> dict[str, object]:
-        """Return the figures by name, for a JSON file; None is an error that is infinite."""
+        """
+        Return the figures by name, for a JSON file.
+
+        None is an error that is infinite, and the verdict of a training that was interrupted.
+        """
         box = self.found.drift.box
         states, inputs = box.states, box.inputs
         gains = self.found.drift.input_matrix / SECONDS_PER_TIME_UNIT[self.plant.time_unit]
@@ -174,9 +188,9 @@ class TrainingResult:
             return about
 
         figures: dict[str, object] = {
-            'accepted': self.accepted,
+            'accepted': None if self.verdict == 'unfinished' else self.accepted,
             'found': self.found_text,
-            'model_class': 'none learned' if self.learned is None else self.learned.chosen.name,
+            'model_class': self.model_class,
             'reasons': list(self.reasons),
             'warnings': list(self.warnings),
             'model_file': self.model_file,
@@ -205,12 +219,12 @@ class TrainingResult:
                 'standing': one.standing.name.lower(), 'text': str(one)}
                 for one in self.found.constants},
         }
+        if self.learned:
+            figures['classes'] = {one.name: of_class(one) for one in self.learned.contenders}
         if self.decision and self.learned:
             trained, fit = self.learned.model.states, self.learned.figures.fit
             check = self.decision.law_check
             figures |= {
-                'model_class': self.learned.chosen.name,
-                'classes': {one.name: of_class(one) for one in self.learned.contenders},
                 'trained_from': by_state(trained.lower),
                 'trained_to': by_state(trained.upper),
                 'heldout_error': by_state(self.decision.rmse),

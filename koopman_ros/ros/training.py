@@ -102,7 +102,7 @@ class Training:
         return announcement
 
     def complete(self) -> None:
-        """End a training that is under way; nothing is written then."""
+        """End a training that is under way, which keeps the best model so far."""
         if self._job is not None:
             self._job.close()
             # it may have ended well just before

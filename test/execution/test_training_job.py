@@ -19,7 +19,9 @@ from koopman_ros.core.paths import model_path
 from koopman_ros.execution import job as job_module
 from koopman_ros.execution import training
 from koopman_ros.execution.training import JobState, TrainingJob
+from koopman_ros.model import load
 from support.nodes import TIMEOUT, wait_until_ended
+from support.quick_retraining import QUICK_CHILD
 from support.recorded_runs import driven, INPUTS, reactor, STATES, write_bag
 
 
@@ -71,6 +73,31 @@ def test_process_that_gets_a_signal(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize('by_signal', [False, True])
+def test_a_cancelled_training_keeps_the_best_class_so_far(
+        task: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+        by_signal: bool) -> None:
+    monkeypatch.setattr(job_module, '_PATIENCE', TIMEOUT)
+    monkeypatch.setattr(
+        TrainingJob, 'command', lambda *_: (sys.executable, '-c', QUICK_CHILD))
+    job = TrainingJob({**task, 'model_class': 'best', 'dead_time': {'coolant_temperature': 0.0}})
+    for state in follow(job):
+        if state.text.startswith('learning: neural drift'):
+            break
+    if by_signal:
+        os.kill(job.process.pid, signal.SIGTERM)
+    else:
+        job.cancel()
+    *_, last = follow(job)
+    job.close()
+    assert (last.cancelled, last.accepted, last.rejected) == (True, False, False)
+    file = tmp_path / 'new.unfinished.safetensors'
+    assert f'kept as {file}' in last.text
+    assert 'classes not tried: neural drift, identity lift, free lift' in last.text
+    assert load(file).provenance.accepted is False
+    assert file.with_suffix('.md').exists()
+
+
 @pytest.mark.parametrize(('program', 'share', 'words'), [
     # a library that prints, a line that is cut off, and an error that nobody expects
     ('import sys; sys.stdin.readline(); print("hello"); print(\'{"progress": 0.5, \'); '
@@ -118,7 +145,7 @@ def test_process_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) ->
     next(follow(job))
     job.close()
     assert job.process.returncode == -signal.SIGKILL
-    assert job.poll().text == 'cancelled; nothing was written'
+    assert job.poll().cancelled
 
 
 def test_figures_are_reported_for_each_signal() -> None:

@@ -5,6 +5,7 @@
 
 from dataclasses import replace
 import math
+import signal
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ from koopman_ros.learning import (
     train,
     TrainingFailed,
 )
-from koopman_ros.learning.identification import identify
+from koopman_ros.learning.identification import identify, Stopped
 from koopman_ros.learning.lift.neural_drift import with_units_of
 from koopman_ros.learning.model_selection import plainest
 from koopman_ros.model import Box
@@ -202,6 +203,28 @@ def test_starts_that_run_out_of_time_are_kept_and_said():
         assert one.model is None or 'limit of processor time' in one.limit
     assert any(one.model is not None for one in networks)
     assert 'limit of processor time' in str(found)
+
+
+def test_ctrl_c_in_the_training_of_a_network_ends_all_classes():
+    names = []
+
+    def press(now):
+        names.append(now.name)
+        if now.iteration == 3:
+            signal.raise_signal(signal.SIGINT)
+        return False
+
+    kept = []
+    with pytest.raises(KeyboardInterrupt):
+        compare(BENT, bent_samples(), {'neural drift': NeuralDrift(3), 'identity lift': SMALL},
+                starts=2, loops=0, watch=press, on_class=kept.append)
+    assert set(names) == {'neural drift'}
+    assert [(len(one.contenders), one.untried) for one in kept] == [
+        (1, ('polynomial', 'neural drift', 'identity lift')),
+        (2, ('neural drift', 'identity lift'))]
+    with pytest.raises(Stopped):
+        compare(BENT, bent_samples(), {'neural drift': NeuralDrift(3), 'identity lift': SMALL},
+                starts=2, loops=0, watch=lambda now: now.iteration == 3)
 
 
 def test_a_polynomial_has_fewer_monomials_than_there_are_samples(monkeypatch):

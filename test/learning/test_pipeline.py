@@ -6,6 +6,7 @@
 from dataclasses import asdict, replace
 import json
 from pathlib import Path
+import signal
 import sys
 
 import numpy as np
@@ -258,13 +259,96 @@ def test_a_linear_plant_of_known_gain_needs_no_lift(tmp_path):
 
 @pytest.mark.parametrize(('stage', 'done_before'), [
     ('reading bags', 'bag'), ('estimating: drift of degree 3', 'bag'),
-    ('learning: identity lift, n_z 2', 'estimated'), ('judging: id', 'estimated'),
-    ('writing', 'learned')])
+    ('learning: identity lift, n_z 2', 'estimated'), ('judging: id', 'estimated')])
 def test_stops_at_any_stage_and_writes_nothing(bag, tmp_path, request, stage, done_before):
     request.getfixturevalue(done_before)
     with pytest.raises(Stopped):
         retrain(small(bag, tmp_path / 'new.safetensors'), lambda _, text: text.startswith(stage))
     assert list(tmp_path.iterdir()) == []
+
+
+def files_in(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+KEPT = ['new.unfinished.json', 'new.unfinished.md', 'new.unfinished.safetensors']
+
+
+@pytest.mark.parametrize('key', [False, True], ids=['by the watch', 'by Ctrl-C'])
+@pytest.mark.parametrize(('stage', 'tried', 'untried'), [
+    ('judging: polynomial', ['linear'],
+     ('polynomial', 'neural drift', 'identity lift', 'free lift')),
+    ('learning: neural drift', ['linear', 'polynomial'],
+     ('neural drift', 'identity lift', 'free lift'))])
+def test_an_interrupted_training_keeps_the_best_class_so_far(
+        bag, tmp_path, estimated, key, stage, tried, untried):
+    def stop(_, text):
+        if key and text.startswith(stage):
+            signal.raise_signal(signal.SIGINT)
+        return text.startswith(stage)
+
+    task = small(bag, tmp_path / 'new.safetensors', model_class='best')
+    if key:
+        with pytest.raises(KeyboardInterrupt) as interrupt:
+            retrain(task, stop)
+        result = interrupt.value.result
+        assert f'classes not tried: {untried[0]}' in str(interrupt.value)
+    else:
+        result = retrain(task, stop)
+    assert [one.name for one in result.learned.contenders] == tried
+    assert result.learned.untried == untried
+    assert (result.verdict, result.accepted, result.model_class) == (
+        'unfinished', False, tried[-1])
+    assert files_in(tmp_path) == KEPT
+    assert result.model_file == str(tmp_path / KEPT[-1])
+    kept = load(result.model_file)
+    assert kept.provenance.accepted is False
+    assert kept.provenance.reasons == result.reasons
+    assert kept.provenance.model_class == tried[-1]
+    assert len(kept.dead_time) == 1
+    page, figures = ((tmp_path / name).read_text() for name in KEPT[1::-1])
+    assert f'classes not tried: {", ".join(untried)}' in page
+    assert json.loads(figures)['accepted'] is None
+    assert list(json.loads(figures)['classes']) == tried
+
+
+def test_what_is_kept_goes_when_the_training_ends(bag, tmp_path, learned, accepted, monkeypatch):
+    def compare_classes(*_, on_class, **__):
+        on_class(accepted[0].learned)
+        return accepted[0].learned
+
+    monkeypatch.setattr(pipeline, 'compare_classes', compare_classes)
+    task, seen = small(bag, tmp_path / 'new.safetensors'), []
+    assert retrain(task, lambda *_: bool(seen.append(files_in(tmp_path)))).accepted
+    assert KEPT in seen
+    assert files_in(tmp_path) == ['new.safetensors']
+    # also one that was judged, but not written
+    unfinished = retrain(task, lambda _, text: text == 'writing')
+    assert unfinished.verdict == 'unfinished'
+    assert 'before the acceptance test' in unfinished.reasons[0]
+    assert 'not tried' not in unfinished.reasons[0]
+
+
+def test_without_an_output_an_interrupt_writes_nothing(bag, tmp_path, learned, accepted,
+                                                       monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(pipeline, 'compare_classes', lambda *_, on_class, **__: (
+        on_class(accepted[0].learned), accepted[0].learned)[1])
+    result = retrain(small(bag, ''), lambda _, text: text == 'writing')
+    assert (result.verdict, result.model_file) == ('unfinished', '')
+    assert files_in(tmp_path) == []
+
+
+def test_ctrl_c_before_the_first_class_ends_a_training_with_nothing(bag, tmp_path, estimated):
+    def press(_, text):
+        if text.startswith('judging: linear'):
+            signal.raise_signal(signal.SIGINT)
+        return False
+
+    with pytest.raises(KeyboardInterrupt) as interrupt:
+        retrain(small(bag, tmp_path / 'new.safetensors', model_class='best'), press)
+    assert interrupt.value.result is None
+    assert files_in(tmp_path) == []
 
 
 def test_a_task_survives_json():

@@ -48,20 +48,23 @@ def page_of(retrained: pipeline.TrainingResult) -> str:
     return '\n\n'.join(map(str, _sections(retrained)))
 
 
-_CHILD = f"""
-import sys
+# program of a training in a process of its own that is quick and draws no pictures
+QUICK_CHILD = f"""
+import os, signal, sys
 sys.path.insert(0, {str(Path(__file__).parents[1])!r})
-from koopman_ros.learning import report, training_process
+from koopman_ros.learning import report
+from koopman_ros.process_entry import run_child
 from support.quick_retraining import quick_retraining
 report._draw = lambda *_: False
 with quick_retraining(8):
-    sys.exit(training_process.main())
+    sys.exit(run_child(os.getppid(), signal.SIGKILL, 1, 'koopman_ros.learning.training_process',
+                       ()))
 """
 # program of a trainer whose trainings, each in its process, are quick and draw no pictures
 QUICK_TRAINER = f"""
 import sys
 from koopman_ros.execution.training import TrainingJob
 from koopman_ros.nodes import trainer
-TrainingJob.command = lambda *_: (sys.executable, '-c', {_CHILD!r})
+TrainingJob.command = lambda *_: (sys.executable, '-c', {QUICK_CHILD!r})
 sys.exit(trainer.main())
 """

@@ -4,6 +4,7 @@
 """Choice of a drift model on held-out segments."""
 
 from dataclasses import replace
+import signal
 import sys
 
 import numpy as np
@@ -190,6 +191,22 @@ def test_progress_and_stop(noisy):
                      watch=lambda *step, again=again, stop=stop: (
                          again.append(step) or len(again) == stop))
         assert again == seen[:stop]
+
+
+@pytest.mark.parametrize('text', ['drift of degree 1', 'drift of degree 3 on all episodes'])
+def test_ctrl_c_ends_it_in_the_midst_of_a_refinement(noisy, text):
+    seen = []
+
+    def press(*step):
+        seen.append(step[-1])
+        if seen.count(text) == 3:
+            signal.raise_signal(signal.SIGINT)
+        return False
+
+    with pytest.raises(KeyboardInterrupt):
+        identify(CUBIC.plant, [noisy.part(0, 160)], degrees=(1, 3), methods=methods(10),
+                 watch=press)
+    assert seen[-1] == text
 
 
 def changed(record, **values):
