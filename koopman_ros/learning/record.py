@@ -18,7 +18,6 @@ from koopman_ros.execution import Backend, Notify, Serial
 from koopman_ros.learning.downsampling import RecordStatistics, SEGMENT, Selection
 from koopman_ros.records import (
     ImportReport,
-    loop_episodes,
     Record,
     RecordedInput,
     RecordedState,
@@ -95,11 +94,11 @@ def read_record(source: RecordSource, most: int, seed: int, *, hidden: bool = Fa
     :param backend: where long records are read, a bag a task; this process by default.
     :raises BagReadError: for bags that cannot be used.
     """
-    if source.size() <= most:
-        return TrainingRecord(*loop_episodes(source.bags, source.states, source.inputs,
-                                             tolerance_ns=source.tolerance_ns,
-                                             least_jumps=source.least_jumps))
     account = ImportReport()
+    if source.size() <= most:
+        return TrainingRecord(list(stream_episodes(
+            source.bags, source.states, source.inputs, account, tolerance_ns=source.tolerance_ns,
+            least_jumps=source.least_jumps)), account)
     bags = {str(bag): (number, str(bag))
             for number, bag in enumerate(distinct(source.bags, account))}
 

@@ -4,7 +4,7 @@
 """Records of plants: tables, and bags of rosbag2 (MCAP), written and read without ROS."""
 
 from koopman_ros.records.decoding import BagMessage
-from koopman_ros.records.episodes import loop_episodes, stream_episodes
+from koopman_ros.records.episodes import stream_episodes
 from koopman_ros.records.import_spec import ImportReport, RecordedInput, RecordedState
 from koopman_ros.records.mcap_file import BagReadError
 from koopman_ros.records.message_definitions import (
@@ -30,7 +30,6 @@ __all__ = [
     'RecordedState',
     'Series',
     'in_log_order',
-    'loop_episodes',
     'message_definition',
     'read',
     'read_messages',

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from koopman_ros.core.arrays import Array
 from koopman_ros.core.datasets import Episode
 from koopman_ros.core.units import quantity_text
 from koopman_ros.records.applied_inputs import Applied, span
-from koopman_ros.records.import_spec import break_notes, ImportReport
+from koopman_ros.records.import_spec import ImportReport
 
 
 @dataclass(frozen=True)
@@ -188,11 +189,11 @@ class EpisodeCutter:
             at = f'at {times[end - 1] / self.per_second:.3f} s'
             if gap[end]:
                 seconds = float(step[end]) / self.per_second
-                self.breaks['gap'].append((seconds, f'{seconds:.3f} s {at}'))
+                self.breaks['gap of'].append((seconds, f'{seconds:.3f} s {at}'))
             else:
                 j = int(jumps[end])
                 level = f'{quantity_text(x[end, j], self.units[j])} ({self.names[j]})'
-                self.breaks['jump'].append((abs(float(x[end, j])), f'{level} {at}'))
+                self.breaks['jump to'].append((abs(float(x[end, j])), f'{level} {at}'))
         return ends
 
     def _episode(self, times: NDArray[Any], x: Array, applied: Sequence[Applied]
@@ -211,4 +212,8 @@ class EpisodeCutter:
 
     def note_breaks(self) -> None:
         """Note the ends of episodes, one sentence for each reason."""
-        self.report.notes += break_notes(self.label, self.breaks)
+        for reason, found in self.breaks.items():
+            first, (_, largest) = found[0][1], max(found, key=itemgetter(0))
+            self.report.note(f'{self.label}: {reason} {first}, ' + (
+                'a new episode begins' if len(found) == 1 else f'the first of {len(found)}, the '
+                f'largest {largest}; a new episode begins at each'))

@@ -34,20 +34,6 @@ _SAME_PACE = 0.02
 _SAME_PACE_SECONDS = 1.0
 
 
-def loop_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[RecordedState],
-                  inputs: Sequence[RecordedInput], *, tolerance_ns: int = 0,
-                  least_jumps: Sequence[float] | None = None) -> tuple[list[Episode],
-                                                                       ImportReport]:
-    """
-    Return all episodes of some bags, see :func:`stream_episodes`, and the account of the import.
-
-    :raises BagReadError: as it does.
-    """
-    account = ImportReport()
-    return list(stream_episodes(bags, states, inputs, account, tolerance_ns=tolerance_ns,
-                                least_jumps=least_jumps)), account
-
-
 def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[RecordedState],
                     inputs: Sequence[RecordedInput], account: ImportReport, *,
                     tolerance_ns: int = 0,
@@ -55,24 +41,20 @@ def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Rec
     """
     Yield the episodes of some bags: times in s since the first measurement of each.
 
-    Nothing is resampled: measurements keep their stamps. Where there are several states, the
-    nearest stamps of the others are put to each stamp of the one that is measured least; types
-    without a stamp count at receipt.
+    Nothing is resampled: the nearest stamps of the other states are put to each stamp of the one
+    that is measured least; types without a stamp count at receipt.
 
     An input that was measured throughout an episode is linear between its measurements. Where it
     was not, or where it is no more than its command within the range that it reaches, it is held
     from the time on at which it was commanded. Without commands in the bag it is linear, or held
-    if it mostly keeps its value. A command that answers a measurement carries its
-    stamp; where the stamps are those of the wall clock, it acts later by the time between the two
-    receipts. A command without a stamp acts when it is received.
+    if it mostly keeps its value. A command that answers a measurement carries its stamp; where
+    the stamps are those of the wall clock, it acts later by the time between the two receipts. A
+    command without a stamp acts when it is received.
 
-    Episodes end at gaps, where time is set back, and where a state jumps to another level as after
-    a reset. Spikes are dropped, and so are measurements before the first input, because the
-    applied input is unknown before. A bag that was not closed or is damaged is read as
-    far as it goes. The account lists all of that.
-
-    Memory does not grow with the bags: of a long record some ten thousand measurements are
-    put together at a time, at whose ends an episode ends, too.
+    Episodes end at gaps, where time is set back, and where a state jumps to another level. A bag
+    that was not closed or is damaged is read as far as it goes. Memory does not grow with the
+    bags: of a long record some ten thousand measurements are put together at a time, at whose ends
+    an episode ends, too.
 
     :param account: is added to as the episodes come.
     :param tolerance_ns: how far stamps of one sample of several states may lie apart.
@@ -170,7 +152,7 @@ class _BagImport:
                 stamp_ns, value = accepted
                 if back_ns := segment.set_back(number, stamp_ns):
                     back = back_ns / NANOSECONDS
-                    self.cutter.breaks['set back'].append((back, f'{back:.3f} s'))
+                    self.cutter.breaks['time was set back by'].append((back, f'{back:.3f} s'))
                     yield segment
                     segment = Segment(places, n_x)
                 segment.add(number, stamp_ns, message.log_time_ns, value)

@@ -4,16 +4,9 @@
 """The signals to import from bags, and the account of an import."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import itemgetter
 
 from koopman_ros.core.message_fields import MessageField
-
-# The reason for the end of an episode, for the first and for the largest of several.
-_ENDS = {'set back': ('time was set back by {}', 'at most by {}'),
-         'gap': ('gap of {}', 'the longest of {}'),
-         'jump': ('jump to {}', 'the highest to {}')}
 
 
 @dataclass(frozen=True)
@@ -79,18 +72,3 @@ def places_of(signal: RecordedState | RecordedInput) -> list[MessageField]:
     if isinstance(signal, RecordedState):
         return [signal.place]
     return [found for found in (signal.command, signal.measured) if found is not None]
-
-
-#: The ends of episodes in a bag: by reason, each with its amount and this in words.
-EpisodeBreaks = Mapping[str, Sequence[tuple[float, str]]]
-
-
-def break_notes(bag: str, breaks: EpisodeBreaks) -> Iterator[str]:
-    """Yield one sentence for each reason, however often it ended an episode."""
-    for kind, (words, most) in _ENDS.items():
-        if found := breaks.get(kind):
-            _, first = found[0]
-            _, largest = max(found, key=itemgetter(0))
-            yield f'{bag}: {words.format(first)}, ' + (
-                'a new episode begins' if len(found) == 1 else
-                f'the first of {len(found)}, {most.format(largest)}; a new episode begins at each')

@@ -19,7 +19,7 @@ from koopman_ros.core.datasets import Episode, PlantDescription
 from koopman_ros.core.message_fields import base_name, place, SIGNAL_NAME
 from koopman_ros.core.signals import check_text
 from koopman_ros.core.units import check_unit, NANOSECONDS
-from koopman_ros.records.episodes import loop_episodes
+from koopman_ros.records.episodes import stream_episodes
 from koopman_ros.records.import_spec import ImportReport, RecordedInput, RecordedState
 from koopman_ros.records.table_import import conversion_of, import_table
 from koopman_ros.records.tables import SignalColumn, Source, table_of
@@ -144,16 +144,15 @@ def read(source: Source, states: Names, inputs: Names, *, time: str = '', period
     of_states, of_inputs = (tuple(map(SignalColumn.of, _names(some, role)))
                             for some, role in ((states, 'states'), (inputs, 'inputs')))
     _check_names(of_states, of_inputs, _names(linear, 'linear'))
-    report, episodes = ImportReport(), []
+    report = ImportReport()
+    episodes: list[Episode] = []
     for number, one in enumerate(sources):
         label = os.fspath(one) if isinstance(one, str | os.PathLike) else f'table {number + 1}'
         if _is_bag(one):
-            found, own = loop_episodes(
-                [one], [_recorded_state(signal) for signal in of_states],
-                [_recorded_input(signal) for signal in of_inputs],
+            episodes += stream_episodes(
+                [one], list(map(_recorded_state, of_states)),
+                list(map(_recorded_input, of_inputs)), report,
                 tolerance_ns=round(tolerance * NANOSECONDS))
-            report.add(own)
-            episodes += found
             continue
         table = table_of(one, label).with_tags(
             [signal.column for signal in (*of_states, *of_inputs)], time)

@@ -148,8 +148,7 @@ class Segment:
         found = Segment(self._places, len(self._states))
         found.applied, found._latest_ns = self.applied, self._latest_ns
         clock = self.clock()
-        for place, (stamps_ns, logs_ns, values) in zip(
-                self._places, found._columns, strict=True):
+        for number, place in enumerate(self._places):
             entries = self.of(place)
             stamps = clock.on(entries, 0).stamp_ns
             after = stamps > self.until_ns
@@ -157,9 +156,9 @@ class Segment:
                 before = np.flatnonzero(~after)
                 after[before[np.argsort(stamps[before], kind='stable')[-_KEPT:]]] = True
             rest = entries.part(after)
-            stamps_ns.frombytes(rest.stamp_ns.tobytes())
-            logs_ns.frombytes(rest.log_ns.tobytes())
-            values.frombytes(rest.values.tobytes())
+            found._columns[number] = (
+                array('q', rest.stamp_ns.tobytes()), array('q', rest.log_ns.tobytes()),
+                array('d', rest.values.tobytes()))
         return found
 
 

@@ -35,7 +35,7 @@ def import_table(table: Table, seconds: Array, states: Sequence[SignalColumn],
     :param seconds: (R,) times of its rows, NaN where there is none.
     :param linear: names of the inputs that are linear from row to row.
     """
-    report.notes += table.notes
+    report.notes += [f'{table.label}: {note}' for note in table.notes]
     cutter = EpisodeCutter(table.label, [one.name for one in states], [one.unit for one in states],
                            report)
     x, u = (np.column_stack([_values(table, one, report, one in states) for one in some])
@@ -53,7 +53,7 @@ def import_table(table: Table, seconds: Array, states: Sequence[SignalColumn],
     back = np.flatnonzero(np.diff(seconds) < 0.0) + 1
     for end in back.tolist():
         amount = seconds[end - 1] - seconds[end]
-        cutter.breaks['set back'].append((amount, f'{amount:.3f} s'))
+        cutter.breaks['time was set back by'].append((amount, f'{amount:.3f} s'))
     for rows in np.split(np.arange(len(seconds)), back):
         if not len(rows):
             continue

@@ -93,9 +93,9 @@ class Table:
     units: Sequence[str]  #: in a row below the headers; empty where there is none
     frame: Any  #: by the number of the column; its index numbers the rows for people
     separator: str = ''  #: of the cells of a text table
+    notes: Sequence[str] = ()  #: about lines that may be wrong
     indexed: bool = False  #: whether the first column is an index of times
     tagged: bool = False  #: whether it had a row for each value of a signal
-    notes: Sequence[str] = ()
 
     def find(self, column: str, unit: str = '') -> int | None:
         """
@@ -339,9 +339,7 @@ def table_of(source: Source, label: str = 'table') -> Table:
         raise ValueError(f'{source} is not a file: give a file')
     try:
         if kind in _TEXT:
-            text = read_text_table(path)
-            return Table(str(source), text.headers, text.units, text.frame, text.separator,
-                         notes=[f'{source}: {note}' for note in text.notes])
+            return Table(str(source), *read_text_table(path))
         if kind == '.parquet':
             return _of_frame(pd.read_parquet(path), str(source))
         from scipy.io import loadmat

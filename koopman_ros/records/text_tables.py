@@ -12,7 +12,6 @@ import itertools
 from pathlib import Path
 import re
 from typing import Any, NamedTuple
-import warnings
 
 # A number, a date or a time; other texts with digits are names.
 _VALUE = re.compile(r'[-+.,]?\d(?:[^A-Za-z]|[eE][-+]?\d|T(?=\d)|Z|\s?[AaPp]\.?[Mm]\.?'
@@ -29,22 +28,14 @@ class TextTableRules:
     longest: int = 2 ** 16  #: characters of one of these lines
 
 
-class TextTable(NamedTuple):
-    """Cells of a text table below its headers."""
-
-    headers: Sequence[str]
-    units: Sequence[str]  #: cells of the row below the headers, empty where there is none
-    frame: Any  #: texts by the number of the column; its index numbers the lines of the file
-    separator: str
-    notes: Sequence[str]  #: about lines that may be wrong
-
-
-def read_text_table(path: Path, rules: TextTableRules = TextTableRules()) -> TextTable:
+def read_text_table(path: Path, rules: TextTableRules = TextTableRules()
+                    ) -> tuple[list[str], list[str], Any, str, list[str]]:
     """
-    Return the cells of a text table.
+    Return headers, units in the row below, cells, separator and notes of a text table.
 
-    The headers are names above two rows with numbers. Lines above them, comments, repeated headers
-    and a last line that is cut short are left out.
+    The headers are names above two rows with numbers. The cells are texts in a DataFrame, by the
+    number of the column and of the line. Lines above the headers, comments, repeated headers and a
+    last line that is cut short are left out.
 
     :raises ValueError: for a file without headers, or with rows of another length.
     """
@@ -65,35 +56,28 @@ def read_text_table(path: Path, rules: TextTableRules = TextTableRules()) -> Tex
         raise ValueError('no row of headers with numbers in as many cells below it, but: '
                          f'{"".join(lines).strip()[:60]!r}')
     head = max(heads, key=lambda one: one.rows)
-    width, first, notes, cut = len(head.units), head.first, [], 0
+    width, kept, notes = len(head.units), {}, []
     with path.open(encoding=encoding, newline='') as file:
-        rows = csv.reader(itertools.islice(file, first, None), delimiter=head.separator,
+        rows = csv.reader(itertools.islice(file, head.first, None), delimiter=head.separator,
                           skipinitialspace=True)
-        for cells in rows:
-            # rows of texts alone are comments, as at the end
-            if len(cells) == width or not any(_VALUE.fullmatch(cell.strip()) for cell in cells):
+        for row in rows:
+            cells, line = [cell.strip() for cell in row], head.first + rows.line_num
+            if cells[:len(head.headers)] == head.headers or not any(cells) or (
+                    cells[0].startswith('#') and cells[0] != '#'):
                 continue
-            line = first + rows.line_num
-            if ended or len(cells) > width or next(rows, None) is not None:
-                raise ValueError(f'line {line} has {len(cells)} cells, but line {first + 1}, the '
-                                 f'first row of numbers, has {width}')
-            cut = line
-            notes = [f'line {line}, the last one, is cut short: left out']
-        if not (ended or cut):
-            notes = [f'line {first + rows.line_num}, the last one, has no end: its last number '
-                     'may be cut short']
-    with warnings.catch_warnings():
-        # about longer rows: those left are comments
-        warnings.simplefilter('ignore', pd.errors.ParserWarning)
-        frame = pd.read_csv(
-            path, sep=head.separator, header=None, names=range(width), index_col=False, dtype=str,
-            keep_default_na=False, skip_blank_lines=False, skipinitialspace=True, skiprows=first,
-            encoding=encoding).apply(lambda column: column.str.strip())
-    frame.index = frame.index + first + 1
-    repeated = (frame[list(range(len(head.headers)))] == head.headers).all(axis=1)
-    comment = frame[0].str.startswith('#') & (frame[0] != '#')
-    frame = frame[~(repeated | comment | (frame.index == cut)) & (frame != '').any(axis=1)]
-    return TextTable(head.headers, head.units, frame, head.separator, notes)
+            if len(cells) == width:
+                kept[line] = cells
+            # rows of texts alone are comments, as at the end
+            elif any(map(_VALUE.fullmatch, cells)):
+                if ended or len(cells) > width or next(rows, None) is not None:
+                    raise ValueError(f'line {line} has {len(cells)} cells, but line '
+                                     f'{head.first + 1}, the first row of numbers, has {width}')
+                notes = [f'line {line}, the last one, is cut short: left out']
+        if not (ended or notes):
+            notes = [f'line {head.first + rows.line_num}, the last one, has no end: its last '
+                     'number may be cut short']
+    frame = pd.DataFrame(list(kept.values()), list(kept), range(width), dtype=object)
+    return head.headers, head.units, frame, head.separator, notes
 
 
 class _Head(NamedTuple):

@@ -14,7 +14,8 @@ from koopman_ros.learning import retrain, TrainingTask
 from koopman_ros.learning.identification import Stopped
 from koopman_ros.learning.record import read_record, reduced
 from koopman_ros.plants import describe
-from koopman_ros.records import loop_episodes, read, Record
+from koopman_ros.records import read, Record
+from support.bag_samples import loop_episodes
 from support.long_records import bags_of, drift_error, source, SYSTEM, task
 from support.long_records import SAMPLES as LENGTH
 from support.quick_retraining import page_of, quick_retraining

@@ -10,8 +10,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
 from koopman_ros.core.message_fields import MessageField
-from koopman_ros.records import loop_episodes, RecordedInput, RecordedState
+from koopman_ros.records import RecordedInput, RecordedState
 from koopman_ros.testing import Harness
+from support.bag_samples import loop_episodes
 
 LEVELS = {'level_1': 0.1, 'level_2': 0.15}  # m
 TYPES = {f'{name}.type': 'std_msgs/msg/Float64' for name in LEVELS}

@@ -27,7 +27,7 @@ import zstandard
 from koopman_ros import records
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import NANOSECONDS as SECOND
-from support.bag_samples import compressed_files, NUMBER, number
+from support.bag_samples import compressed_files, loop_episodes, NUMBER, number
 
 MUTANTS = int(os.environ.get('BAG_MUTANTS', '25'))
 MESSAGES = 60  # on each of two topics
@@ -130,7 +130,7 @@ def test_cut_file_and_random_bytes_behind_it(tmp_path: Path, name: str) -> None:
         assert (summary.message_count, summary.complete) == (len(found), False), seed
         if cut == len(whole):
             assert len(found) == len(SENT)
-            _, account = records.loop_episodes([path], [STATE], [INPUT])
+            _, account = loop_episodes([path], [STATE], [INPUT])
             assert account.measurements == MESSAGES
             assert any('not closed or is damaged' in note for note in account.notes)
 
@@ -225,7 +225,7 @@ def test_damaged_bag_is_read_or_rejected(
             strict, recovered = (attempt(lambda recover=recover: content(path, recover=recover))
                                  for recover in (False, True))
             summary = attempt(lambda: records.summary(path))
-            attempt(lambda: records.loop_episodes([path], [STATE], [INPUT]))
+            attempt(lambda: loop_episodes([path], [STATE], [INPUT]))
             if guarded:
                 assert strict is None or strict == SENT
                 assert recovered is None or set(recovered) <= set(SENT)

@@ -17,7 +17,7 @@ from koopman_ros.core.datasets import Episode
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.plants import one_state_reactor, random_steps, RandomStepDesign
 from koopman_ros.records.cutter import spikes_and_jumps
-from support.bag_samples import noted, PRESSURE, Sample, Sent, TEMPERATURE, WALL
+from support.bag_samples import loop_episodes, noted, PRESSURE, Sample, Sent, TEMPERATURE, WALL
 
 MEASURED, COMMAND = '/level', '/valve'
 STATE = records.RecordedState('level', 'Pa',
@@ -45,7 +45,7 @@ def write(write_sent: Callable[..., Path]) -> Callable[..., Path]:
 
 
 def read(*paths: Path) -> tuple[list[Episode], records.ImportReport]:
-    episodes, account = records.loop_episodes(paths, [STATE], [INPUT])
+    episodes, account = loop_episodes(paths, [STATE], [INPUT])
     assert account.used == sum(map(len, episodes))
     return episodes, account
 
@@ -152,7 +152,7 @@ def test_wall_clock_answers_act_when_they_arrive(write: Callable[..., Path]) -> 
 
 
 def test_dead_time_of_the_actuator(write: Callable[..., Path]) -> None:
-    (episode,), account = records.loop_episodes(
+    (episode,), account = loop_episodes(
         [write(loop(20))], [STATE], [replace(INPUT, delay=2.000000001)])
     # to the nanosecond, from the first measurement on, at 4 s
     assert episode.input_time[:3].tolist() == [1e-9 - 1.0, 1e-9, 1e-9 + 1.0]
@@ -239,14 +239,14 @@ def test_topics_that_are_not_there(write: Callable[..., Path], tmp_path: Path) -
             (tmp_path / 'none.mcap', INPUT, r'none\.mcap'),
             (tmp_path / 'empty.mcap', INPUT, r'empty\.mcap')):
         with pytest.raises(records.BagReadError, match=words):
-            records.loop_episodes([path], [STATE], [signal])
+            loop_episodes([path], [STATE], [signal])
     with pytest.raises(records.BagReadError,
                        match="has no topic '/valve_2'"):
         records.read_series(bag, replace(INPUT.command, topic='/valve_2'))
 
 
 def test_episodes_are_converted_to_the_requested_units(write: Callable[..., Path]) -> None:
-    (episode,), _ = records.loop_episodes(
+    (episode,), _ = loop_episodes(
         [write(loop(15))], [replace(STATE, unit='kPa')], [replace(INPUT, unit='mbar')])
     assert episode.x[0, 0] == pytest.approx(0.001)
     assert episode.u[0, 0] == pytest.approx(1.01)
@@ -297,7 +297,7 @@ def test_type_that_only_bears_the_name(
         writer.write('/t', sample.data, 1)
     place = replace(TEMPERATURES, topic='/t')
     for read in (lambda: records.read_series(writer.path, place),
-                 lambda: records.loop_episodes(
+                 lambda: loop_episodes(
                      [writer.path], [records.RecordedState('x', 'K', place)],
                      [records.RecordedInput('u', 'K', place)])):
         with pytest.raises(records.BagReadError, match=r'different definition|cannot be decoded'):

@@ -15,6 +15,7 @@ from koopman_ros import records
 from koopman_ros.core.datasets import Episode
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.records import segments
+from support.bag_samples import loop_episodes
 from support.long_records import FIELD, TYPE, write
 
 PLACES = {name: MessageField(f'/{name}', TYPE, FIELD, '1') for name in ('warm', 'cold', 'valve',
@@ -46,7 +47,7 @@ def record(path: Path, count: int) -> Path:
 def whole(path: Path, signal: records.RecordedInput, monkeypatch: pytest.MonkeyPatch) -> Episode:
     with monkeypatch.context() as patch:
         patch.setattr(segments, 'MOST', 10 ** 9)
-        (episode,), _ = records.loop_episodes([path], STATES, [signal])
+        (episode,), _ = loop_episodes([path], STATES, [signal])
     return episode
 
 
@@ -61,7 +62,7 @@ def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_portions_together_equal_the_whole_record(
     long: Path, monkeypatch: pytest.MonkeyPatch, signal: records.RecordedInput) -> None:
     expected = whole(long, signal, monkeypatch)
-    episodes, account = records.loop_episodes([long], STATES, [signal])
+    episodes, account = loop_episodes([long], STATES, [signal])
     # nearly equal ones
     assert len(episodes) == 5
     assert max(map(len, episodes)) <= 1800
@@ -86,7 +87,7 @@ def test_command_of_an_earlier_portion_is_held(tmp_path: Path) -> None:
     both.mkdir()
     write(both / 'both_0.mcap', ['/valve'], np.array([[3.0]]), PERIOD)
     path.rename(both / 'both_1.mcap')
-    episodes, account = records.loop_episodes([both], STATES, [COMMANDED])
+    episodes, account = loop_episodes([both], STATES, [COMMANDED])
     assert (len(episodes), account.used) == (4, 14_000)
     for one in episodes:
         assert one.u[:, 0].tolist() == [3.0]
@@ -98,7 +99,7 @@ def test_state_that_falls_silent_does_not_hold_up_the_others(tmp_path: Path) -> 
     both.mkdir()
     write(both / 'both_0.mcap', ['/valve', '/cold'], np.ones((30, 2)), PERIOD)
     write(both / 'both_1.mcap', ['/warm'], time[:, None], PERIOD)
-    _, account = records.loop_episodes([both], STATES, [COMMANDED])
+    _, account = loop_episodes([both], STATES, [COMMANDED])
     assert account.used == 60
     assert account.dropped == {'measurement without cold': 20_000 - 30}
 

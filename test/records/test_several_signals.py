@@ -15,7 +15,7 @@ from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import NANOSECONDS as SECOND
 from koopman_ros.records import RecordedInput, RecordedState
 from koopman_ros.records.applied_inputs import follows_command
-from support.bag_samples import FLOAT, JOINTS, noted, Sent, TEMPERATURE
+from support.bag_samples import FLOAT, JOINTS, loop_episodes, noted, Sent, TEMPERATURE
 
 WARM = RecordedState('warm', 'K', MessageField('/warm', TEMPERATURE, 'temperature', 'degC'))
 COLD = RecordedState('cold', 'K', MessageField('/cold', TEMPERATURE, 'temperature', 'degC'))
@@ -45,7 +45,7 @@ def test_an_input_without_commands_is_taken_from_its_measurements(
 ) -> None:
     path = write([s for k, value in enumerate(values, 1) for s in (
         Sent('/warm', k, 50.0 + k), Sent('/jacket', k, value))])
-    (episode,), account = records.loop_episodes([path], [WARM], [JACKET])
+    (episode,), account = loop_episodes([path], [WARM], [JACKET])
     assert (len(episode), episode.linear) == (15, linear)
     assert episode.inputs_at(np.array([0.0, 0.5, 5.0]))[:, 0] == pytest.approx(
         273.15 + np.array(acting))
@@ -60,7 +60,7 @@ def test_an_input_without_commands_that_is_not_measured_throughout(write: Callab
                                                                    ) -> None:
     path = write([*(Sent('/warm', k, 50.0 + k) for k in range(1, 31)),
                   *(Sent('/jacket', k, 20.0) for k in range(1, 16))])
-    episodes, account = records.loop_episodes([path], [WARM], [JACKET])
+    episodes, account = loop_episodes([path], [WARM], [JACKET])
     assert not episodes
     assert 'jacket was not always measured, and has no commands' in account.notes[-1]
 
@@ -71,7 +71,7 @@ def test_fields_of_one_message_in_the_units_of_the_signals(write: Callable[..., 
         Sent('/tanks', k, dict(sorted({'low': 10.0 * k, 'high': 500.0 + k}.items(),
                                       reverse=k % 2 == 0))),
         Sent('/pump_setpoint', None, 2.0 + (k > 5), k))])
-    (episode,), account = records.loop_episodes([path], TANKS, [PUMP])
+    (episode,), account = loop_episodes([path], TANKS, [PUMP])
     assert episode.x == pytest.approx(np.column_stack(
         [0.01 * np.arange(1, 16), 0.5 + 0.001 * np.arange(1, 16)]), rel=1e-12)
     assert episode.u[:, 0] == pytest.approx([0.002, 0.003])
@@ -83,7 +83,7 @@ def test_fields_of_one_message_in_the_units_of_the_signals(write: Callable[..., 
 def test_message_without_an_element_is_counted(write: Callable[..., Path]) -> None:
     path = write([s for k in range(1, 16) for s in (
         Sent('/tanks', k, {'low': 1.0, **({} if k == 4 else {'high': 2.0})}), *jacket(1.0))])
-    (episode,), account = records.loop_episodes([path], TANKS, [COMMANDED])
+    (episode,), account = loop_episodes([path], TANKS, [COMMANDED])
     assert len(episode) == 14
     assert account.dropped == {'without position[high]': 1, 'measurement without high': 1}
     assert (account.measurements, account.used) == (30, 28)
@@ -102,7 +102,7 @@ def test_signals_of_several_topics_are_put_together_by_stamp(
 ) -> None:
     path = write([*jacket(1.0), *(s for k in range(1, 21) for s in (
         Sent('/warm', k, 50.0 + k), Sent('/cold', k + shift, 10.0 - k)))])
-    episodes, account = records.loop_episodes([path], [WARM, COLD], [COMMANDED],
+    episodes, account = loop_episodes([path], [WARM, COLD], [COMMANDED],
                                               tolerance_ns=round(tolerance * SECOND))
     assert sum(map(len, episodes)) == left
     assert account.dropped == dropped
@@ -118,7 +118,7 @@ def test_missing_and_doubled_parts_are_named(write: Callable[..., Path]) -> None
         Sent('/warm', k, 50.0 + k), *([] if k in (3, 8) else [Sent('/cold', k, 10.0)])))]
     sent += [Sent('/warm', 5.0, 99.0, 5.5), Sent('/warm', 12.01, 77.0, 12.01)]
     path = write(sorted(sent, key=lambda s: s.received or s.stamp))
-    (episode,), account = records.loop_episodes([path], [WARM, COLD], [COMMANDED],
+    (episode,), account = loop_episodes([path], [WARM, COLD], [COMMANDED],
                                                 tolerance_ns=SECOND // 20)
     assert (episode.x[:, 0] - 323.15).round(9).tolist() == [
         k for k in range(1, 21) if k not in (3, 8)]
@@ -133,13 +133,13 @@ def test_spikes_and_jumps_of_each_state(write: Callable[..., Path]) -> None:
         Sent('/warm', k, 50.0 + 0.1 * k + 30.0 * (k == 40)),
         Sent('/cold', k, 10.0 + 0.1 * k + 25.0 * (k > 70))))])
     recorded = [path], [WARM, COLD], [COMMANDED]
-    episodes, account = records.loop_episodes(*recorded)
+    episodes, account = loop_episodes(*recorded)
     # the other state was measured when one has a spike
     assert [len(episode) for episode in episodes] == [70, 50]
     assert account.dropped == {'spike (warm)': 1}
     assert noted(account, 'jump', '42.1 degC', 'cold', '70.000 s')
     # a change of 25 K may not be one
-    (episode,), _ = records.loop_episodes(*recorded, least_jumps=[1.0, 26.0])
+    (episode,), _ = loop_episodes(*recorded, least_jumps=[1.0, 26.0])
     assert len(episode) == 120
 
 
@@ -150,7 +150,7 @@ def test_the_smallest_jump_is_in_the_unit_of_the_signal(
     path = write([s for k in range(1, 121) for s in (
         Sent('/tanks', k, {'low': 100.0 + 0.1 * k, 'high': 500.0 + 0.1 * k + 25.0 * (k > 70)}),
         Sent('/pump_setpoint', None, 2.0, k))])
-    episodes, _ = records.loop_episodes([path], TANKS, [PUMP], least_jumps=[least] * 2)
+    episodes, _ = loop_episodes([path], TANKS, [PUMP], least_jumps=[least] * 2)
     assert len(episodes) == count
 
 
@@ -160,7 +160,7 @@ def test_states_without_stamps_are_put_together_by_default(write: Callable[..., 
     flow = RecordedState('flow', 'm', MessageField('/flow', FLOAT, 'data', 'm'))
     path = write([*jacket(*[20.0] * 20), *(s for k in range(1, 21) for s in (
         Sent('/level', None, 1.0 + 0.01 * k, k), Sent('/flow', None, 2.0 + 0.01 * k, k + 0.3)))])
-    (episode,), account = records.loop_episodes([path], [level, flow], [COMMANDED])
+    (episode,), account = loop_episodes([path], [level, flow], [COMMANDED])
     assert len(episode) == 20
     assert (episode.x[:, 1] - episode.x[:, 0]).tolist() == pytest.approx([1.0] * 20)
     assert 'no stamp' in ''.join(account.notes)
@@ -172,7 +172,7 @@ def test_states_without_a_stamp_count_at_their_receipt(write: Callable[..., Path
     path = write([Sent('/jacket_setpoint', 1, 1.0, 100.05), *(s for k in range(1, 21) for s in (
         Sent('/warm', k, 50.0 + k, 100.0 + 0.1 * k),
         Sent('/level', None, float(k), 100.001 + 0.1 * k)))])
-    (episode,), account = records.loop_episodes(
+    (episode,), account = loop_episodes(
         [path], [WARM, level], [COMMANDED], tolerance_ns=SECOND // 50)
     assert episode.x[:, 1].tolist() == list(range(1, 21))
     assert episode.time.tolist() == list(range(20))
@@ -202,7 +202,7 @@ def test_input_behind_a_lag_is_linear_between_its_measurements(write: Callable[.
     times = np.arange(1.0, 31.0)
     u = lagging(times, 4.0)
     path = write(jacket_run(u))
-    (episode,), account = records.loop_episodes([path], [WARM], [JACKET])
+    (episode,), account = loop_episodes([path], [WARM], [JACKET])
     assert episode.linear == (True,)
     assert episode.u[:, 0] == pytest.approx(u + 273.15)
     assert episode.input_time.tolist() == episode.time.tolist()
@@ -224,7 +224,7 @@ def test_input_that_follows_at_once_changes_with_its_command(
     times = np.arange(1.0, 31.0)
     u = np.minimum(lagging(times, lag), ceiling)
     path = write(jacket_run(u + noise * np.random.default_rng(0).standard_normal(30)))
-    (episode,), account = records.loop_episodes([path], [WARM], [JACKET])
+    (episode,), account = loop_episodes([path], [WARM], [JACKET])
     assert (episode.linear, account.notes) == ((), [])
     assert episode.u[:, 0] == pytest.approx(np.array(values) + 273.15)
     # to the time, which no measurement tells
@@ -242,13 +242,13 @@ def test_input_that_was_measured_in_part_is_taken_from_its_command(write: Callab
     u = lagging(np.arange(1.0, 31.0), 4.0)
     run = jacket_run(u)
     path = write([s for s in run if s.topic != '/jacket' or not 10 < (s.stamp or 0) < 20])
-    (episode,), account = records.loop_episodes([path], [WARM], [JACKET])
+    (episode,), account = loop_episodes([path], [WARM], [JACKET])
     assert episode.linear == ()
     assert episode.u[:, 0] == pytest.approx(np.array([293.15, 303.15, 283.15]))
     assert noted(account, 'jacket', 'not always measured')
     path.unlink()
     write([s for s in run if s.topic != '/jacket'])
-    (again,), account = records.loop_episodes([path], [WARM], [JACKET])
+    (again,), account = loop_episodes([path], [WARM], [JACKET])
     assert np.array_equal(again.u, episode.u)
     assert noted(account, "no topic '/jacket'")
 
@@ -257,7 +257,7 @@ def test_one_input_measured_and_one_commanded(write: Callable[..., Path]) -> Non
     u = lagging(np.arange(1.0, 31.0), 4.0)
     path = write(sorted([*jacket_run(u), *(Sent('/pump_setpoint', None, q, t) for t, q in (
         (0.5, 1.0), (7.25, 2.0)))], key=lambda s: s.stamp or s.received or 0.0))
-    (episode,), _ = records.loop_episodes([path], [WARM], [JACKET, PUMP])
+    (episode,), _ = loop_episodes([path], [WARM], [JACKET, PUMP])
     assert episode.linear == (True, False)
     # 1 L/s for 6.25 s, then 2 L/s
     assert episode.input_integral(np.array([10.0]))[0, 1] == pytest.approx(0.001 * (6.25 + 7.5))

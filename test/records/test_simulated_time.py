@@ -12,7 +12,7 @@ import pytest
 from koopman_ros import records
 from koopman_ros.core.message_fields import MessageField
 from koopman_ros.core.units import NANOSECONDS as SECOND
-from support.bag_samples import HEAD, NUMBER, number
+from support.bag_samples import HEAD, loop_episodes, NUMBER, number
 
 STATE = records.RecordedState('x', '1', MessageField('/x', NUMBER.type_name, 'data', '1'))
 INPUT = records.RecordedInput('u', '1', MessageField('/u', NUMBER.type_name, 'data', '1'))
@@ -48,7 +48,7 @@ def test_receipts_in_plant_time_count(
         tmp_path: Path, receipt_time: Clock, clock_time: Clock,
         seconds: float) -> None:
     path = write(tmp_path / 'run.mcap', receipt_time, clock_time)
-    episodes, _ = records.loop_episodes([path], [STATE], [INPUT])
+    episodes, _ = loop_episodes([path], [STATE], [INPUT])
     assert max(episode.time[-1] for episode in episodes) == pytest.approx(seconds)
 
 
@@ -62,10 +62,10 @@ def test_receipts_in_another_time_are_rejected(
         tmp_path: Path, clock_time: Clock, words: str) -> None:
     path = write(tmp_path / 'run.mcap', lambda t: WALL + t, clock_time)
     with pytest.raises(records.BagReadError, match=f'{words}.*use_sim_time'):
-        records.loop_episodes([path], [STATE], [INPUT])
+        loop_episodes([path], [STATE], [INPUT])
 
 
 def test_receipts_without_a_clock_are_noted(tmp_path: Path) -> None:
     path = write(tmp_path / 'run.mcap', lambda t: WALL + t, lambda t: t, clock=False)
-    _, account = records.loop_episodes([path], [STATE], [INPUT])
+    _, account = loop_episodes([path], [STATE], [INPUT])
     assert any('have no stamp: the time of receipt' in note for note in account.notes)

@@ -3,7 +3,7 @@
 
 """The content of the bags that the tests write: four topics of ROS's messages, and numbers."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 import struct
@@ -20,7 +20,15 @@ from rosbags.interfaces import (
 import yaml
 import zstandard
 
-from koopman_ros.records import BagWriter, ImportReport, MessageDefinition
+from koopman_ros.core.datasets import Episode
+from koopman_ros.records import (
+    BagWriter,
+    ImportReport,
+    MessageDefinition,
+    RecordedInput,
+    RecordedState,
+    stream_episodes,
+)
 
 TOPICS = {
     '/temperature': 'sensor_msgs/msg/Temperature',
@@ -95,6 +103,14 @@ class Sent:
     stamp: float | None
     value: float | dict[str, float]
     received: float | None = None
+
+
+def loop_episodes(bags: Sequence[Path | str], states: Sequence[RecordedState],
+                  inputs: Sequence[RecordedInput], **options: Any
+                  ) -> tuple[list[Episode], ImportReport]:
+    """Return all episodes of some bags, and the account of the import."""
+    account = ImportReport()
+    return list(stream_episodes(bags, states, inputs, account, **options)), account
 
 
 def noted(account: ImportReport, *words: str) -> bool:
