@@ -121,8 +121,10 @@ def _head(lines: Sequence[str], separator: str) -> _Head | None:
             units = [*named[best + 1:best + 2], [''] * width][0]
             heads.append(_Head(separator, named[best], [*units, ''][:width], ends[k - 1], run))
     if heads:
-        # lines above may look like a small table, and the headers may be repeated
-        longest = max(heads, key=lambda one: one.rows)
+        # lines above may look like a small table, a remark among the rows like headers of one
+        # column, and the headers may be repeated
+        longest = max(heads, key=lambda one: (
+            2 * len(set(filter(None, one.headers))) >= len(one.units), one.rows))
         return next(one for one in heads if one.headers == longest.headers)._replace(
             rows=longest.rows)
     # columns that are called by numbers, and names

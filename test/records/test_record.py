@@ -165,6 +165,13 @@ def test_a_file_that_is_no_table_is_named_with_the_next_step(tmp_path, text, wor
         read(tmp_path / 'day.csv', 'level', 'pump')
 
 
+@pytest.mark.parametrize('remark', ['restarted,,', 'restarted', '# pause', 'time,level,pump'])
+def test_remarks_among_the_rows_are_left_out(tmp_path, remark):
+    rows = [f'{t:g},{x:g},{u:g}' for t, x, u in zip(SECONDS, LEVEL, PUMP, strict=True)]
+    (tmp_path / 'day.csv').write_text('\n'.join(['time,level,pump', *rows[:5], remark, *rows[5:]]))
+    assert levels(tmp_path / 'day.csv').x[:, 0] == pytest.approx(LEVEL, rel=1e-5)
+
+
 def test_a_separator_at_the_end_of_each_row_moves_no_column(tmp_path):
     rows = [f'{t},{x},{u},' for t, x, u in zip(SECONDS, LEVEL, PUMP, strict=True)]
     (tmp_path / 'day.csv').write_text('\n'.join(['time,level,pump', *rows]))
