@@ -154,8 +154,7 @@ def read(source: Source, states: Names, inputs: Names, *, time: str = '', period
                 list(map(_recorded_input, of_inputs)), report,
                 tolerance_ns=round(tolerance * NANOSECONDS))
             continue
-        table = table_of(one, label).with_tags(
-            [signal.column for signal in (*of_states, *of_inputs)], time)
+        table = table_of(one, label).with_tags((*of_states, *of_inputs), time)
         of_states, of_inputs = (tuple(signal.with_unit_in(table, report) for signal in some)
                                 for some in (of_states, of_inputs))
         episodes += import_table(table, table.seconds(time, period, dayfirst, report.note),

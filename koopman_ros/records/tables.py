@@ -190,7 +190,7 @@ class Table:
         return ValueError(f'{self.label}: the record has no column {column!r}, it has '
                           f'{", ".join(map(repr, self.headers))}: name one of them')
 
-    def with_tags(self, wanted: Iterable[str], time: str = '') -> Table:
+    def with_tags(self, wanted: Iterable[SignalColumn], time: str = '') -> Table:
         """
         Return a table with a column for each of some signals, of one with a row for each value.
 
@@ -198,7 +198,7 @@ class Table:
 
         :raises ValueError: for a table whose values may be in several columns.
         """
-        lacking = [column for column in wanted if self.find(column) is None]
+        lacking = [one.column for one in wanted if self.find(one.column, one.unit) is None]
         if not lacking:
             return self
         for tag in self.frame.columns:

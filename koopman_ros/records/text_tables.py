@@ -119,7 +119,8 @@ def _head(lines: Sequence[str], separator: str) -> _Head | None:
             # a title above the headers fills fewer cells
             best = max(range(len(named)), key=lambda i: (len(set(filter(None, named[i]))), -i))
             units = [*named[best + 1:best + 2], [''] * width][0]
-            heads.append(_Head(separator, named[best], [*units, ''][:width], ends[k - 1], run))
+            heads.append(_Head(separator, named[best], [
+                unit.strip('[]') for unit in [*units, ''][:width]], ends[k - 1], run))
     if heads:
         # lines above may look like a small table, a remark among the rows like headers of one
         # column, and the headers may be repeated

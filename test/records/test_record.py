@@ -138,7 +138,8 @@ def test_rejects_times_and_columns_that_are_none(columns, options, words):
 
 
 @pytest.mark.parametrize(('second', 'point', 'separator'), [
-    ('s;m;V', '.', ';'), ('0;1;2', ',', ';'), ('s;m;V', ',', ';'), ('0;1;2', ',', '\t')])
+    ('s;m;V', '.', ';'), ('[s];[m];[V]', '.', ';'), ('0;1;2', ',', ';'), ('s;m;V', ',', ';'),
+    ('0;1;2', ',', '\t')])
 def test_a_row_of_units_below_the_header_and_late_decimal_commas_are_understood(
         tmp_path, second, point, separator):
     rows = [f'{t:g};{x:g};{u:g}'.replace('.', point) for t, x, u in zip(
@@ -191,6 +192,12 @@ def test_a_signal_may_have_another_column_name_and_unit():
                          (('level = TI-101.PV', 'HC12 [squeeze]'), 'no unit')):
         with pytest.raises(ValueError, match=words):
             read(table, *names)
+
+
+def test_of_columns_that_differ_in_the_unit_the_argument_tells_one():
+    table = frame(time=SECONDS, **{'level [cm]': 90.0 * LEVEL})
+    episode = read(table, 'level [cm]', 'pump').episodes[0]
+    assert episode.x[:, 0] == pytest.approx(90.0 * LEVEL)
 
 
 def test_a_missing_value_leaves_the_other_signals():
