@@ -5,14 +5,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Collection, Coroutine
 import contextlib
 from dataclasses import dataclass, field
 import functools
 import inspect
+import time
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
@@ -24,6 +26,7 @@ from rclpy.timer import Timer
 from koopman_ros.core.plugins import contained
 
 _POLL = 0.02  # s between two steps of an asynchronous callback
+LAST_MESSAGES_TIME = 0.5  # s for the last messages to reach their subscribers
 
 
 @dataclass(frozen=True)
@@ -131,6 +134,13 @@ class HostedNode(Node):
                 return None
 
         return call
+
+
+def await_delivery(publishers: Collection[Publisher]) -> None:
+    """Wait until the subscribers have all messages: what is under way is lost with its sender."""
+    deadline = time.monotonic() + LAST_MESSAGES_TIME
+    for publisher in publishers:
+        publisher.wait_for_all_acked(Duration(seconds=max(0.0, deadline - time.monotonic())))
 
 
 def wall_timer(node: HostedNode, seconds: float, callback: Callable[[], Any], **options: Any

@@ -9,10 +9,8 @@ from pathlib import Path
 import re
 import signal
 import sys
-import time
 
 import rclpy
-from rclpy.duration import Duration
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.signals import SignalHandlerOptions
@@ -21,6 +19,7 @@ from rclpy.utilities import remove_ros_args
 from koopman_ros import __version__
 from koopman_ros.core.paths import LOOPBACK_PROFILE
 from koopman_ros.process_entry import force_exit_after, handle_signals
+from koopman_ros.ros.hosted import await_delivery
 from koopman_ros.ros.managed import ManagedNode, one_line, START_ERRORS
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.parameter_files import ignored_sections
@@ -31,7 +30,6 @@ _LOOPS = '--loops'
 # (arguments, file of loops, signals as they come) to the exit code
 LoopRunner = Callable[[list[str] | None, str, list[int]], int]
 LONGEST_WAIT = 0.1  # s from a signal to the end
-LAST_MESSAGES_TIME = 0.5  # s for the last messages to reach their subscribers
 TAKE_DOWN_PATIENCE = 5.0  # s; taking down a participant needs some ten milliseconds
 
 
@@ -116,11 +114,7 @@ def take_down(name: str, node: LoopNode | None, executor: Executor | None,
         # its threads would call into the interpreter while that ends
         executor.shutdown()
     if node is not None:
-        # what is still under way would be lost with its sender
-        deadline = time.monotonic() + LAST_MESSAGES_TIME
-        for publisher in node.publishers:
-            publisher.wait_for_all_acked(
-                Duration(seconds=max(0.0, deadline - time.monotonic())))
+        await_delivery(list(node.publishers))
         node.destroy_node()
     rclpy.try_shutdown()
     # the caller may continue

@@ -149,18 +149,24 @@ SENDER = """
 import os, signal, sys, time
 import rclpy
 from std_msgs.msg import String
-from koopman_ros.ros import process, topics
-process.LAST_MESSAGES_TIME = 20.0
+from koopman_ros.ros import hosted, process, topics
+hosted.LAST_MESSAGES_TIME = 20.0
 rclpy.init()
-node = rclpy.create_node('sender')
-publisher = node.create_publisher(String, 'text', topics.profile(200, reliable=True))
+node = hosted.HostedNode('sender', None)
+endpoints = topics.EndpointMonitor(node, lambda: None)
+publisher = endpoints.publish('text', String, topics.profile(200, reliable=True))
 while not publisher.get_subscription_count():
     time.sleep(0.01)
 os.kill(int(sys.argv[1]), signal.SIGSTOP)
 for _ in range(200):
     publisher.publish(String(data=10_000 * '.'))
 print('sent', flush=True)
-process.take_down('sender', node, None, 30.0)
+if sys.argv[2] == 'node':
+    process.take_down('sender', node, None, 30.0)
+else:
+    endpoints.destroy()
+    print('destroyed', flush=True)
+    signal.pause()
 """
 RECEIVER = """
 import rclpy
@@ -174,16 +180,22 @@ rclpy.spin(node)
 """
 
 
-def test_the_last_messages_arrive_before_their_sender_ends(ros: Harness) -> None:
+@pytest.mark.parametrize('ends', ['node', 'publisher'])
+def test_the_last_messages_arrive_before_their_sender_ends(ros: Harness, ends: str) -> None:
     receiver = ros.start('receiver', command=(sys.executable, '-c', RECEIVER))
-    sender = ros.start('sender', command=(sys.executable, '-c', SENDER, str(receiver.process.pid)))
+    sender = ros.start('sender', command=(
+        sys.executable, '-c', SENDER, str(receiver.process.pid), ends))
     ros.wait_until(lambda: 'sent' in sender.output())
     # a sender that does not wait ends here, and what a stopped receiver has no room for is lost
     with contextlib.suppress(subprocess.TimeoutExpired):
         sender.process.wait(0.5)
     receiver.send(signal.SIGCONT)
     ros.wait_until(lambda: receiver.output().count('.') == 200)
-    assert ros.wait_for_end(sender) == 0
+    if ends == 'node':
+        assert ros.wait_for_end(sender) == 0
+    else:
+        ros.wait_until(lambda: 'destroyed' in sender.output())
+        sender.send(signal.SIGKILL)
     receiver.send(signal.SIGKILL)
 
 
