@@ -151,8 +151,10 @@ def _draw(path: Path, seconds: Array, responses: Mapping[str, Response],
         for panel, name, unit in zip(panels, (TEMPERATURE, VALVE, CONCENTRATION, 'feed'), (
                 'K', 'percent', 'mol/L', 'K'), strict=True):
             panel.set_ylabel(f'{name} [{unit_label(display_unit(unit))}]')
-        temperature.set_title('heated line, 45 s late. Cost over the optimum: ' + ', '.join(
-            f'{name} {response.cost / best:.3f}' for name, response in responses.items()
-            if name != 'optimum'), fontsize=9)
+        temperature.set_title(
+            'heated line, 45 s late. Within the same limits the learned controller costs '
+            f'{responses["learned"].cost / best:.3f} times the optimum,\n' + ', '.join(
+                f'{name} {responses[name].cost / best:.3f} times'
+                for name in ('PI', 'Smith predictor')), fontsize=9)
         panels[-1].set(xlabel='plant time [min]', xlim=(0.0, minutes[-1]))
         legend(figure, panels, 5)

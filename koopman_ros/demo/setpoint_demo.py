@@ -43,7 +43,6 @@ from koopman_ros.demo.loop import Row, run_loop, running_loop, Scenario
 from koopman_ros.demo.results import DemoRun, read_run
 from koopman_ros.evaluation.optimal_cost import (
     cost_along,
-    keeps,
     linear_law,
     OptimalTrajectory,
     optimum,
@@ -64,8 +63,7 @@ PLANT = 'reactor'
 _PANEL_SPEED = 10.0  # at most, of a loop with the panel
 _STYLES: dict[str, dict[str, Any]] = {
     'linear law': {'color': 'tab:red'},
-    'optimum': {'color': 'black', 'linestyle': (0, (1, 2)), 'linewidth': 1.5},
-    'optimum without limits': {'color': '0.5', 'linestyle': (0, (1, 2)), 'linewidth': 1.5}}
+    'optimum': {'color': 'black', 'linestyle': (0, (1, 2)), 'linewidth': 1.5}}
 
 
 @dataclass(frozen=True)
@@ -142,29 +140,31 @@ def run_plant(name: str, export: bool, output: Path, speed: float) -> dict[str, 
                 plant.sample_period / system.seconds_per_time_unit, len(states) - 1)
     before = system.nominal_input if first == 0 else np.array([
         values[first - 1] for values in run.commanded.values()])
-    linear, best = linear_law(task, tuning.limits, before), optimum(task)
-    fair = keeps(task, best, tuning.limits, before)
-    trajectories = {'linear law': linear,
-                    'optimum' if fair else 'optimum without limits': best}
+    linear, best = (of(task, tuning.limits, before) for of in (linear_law, optimum))
     cost = cost_along(task, states, inputs[:-1])
-    title = _conclusion(f'{system.name}: {change}', run, linear, setpoints, signals) + (
-        f'\nCost over the optimum: {cost / best.cost:.3f}, linear law '
-        f'{linear.cost / best.cost:.3g}' if fair else '')
-    _draw(picture, title, run, trajectories, signals, scenario, model.states, tuning, code)
+    ratio, linear_ratio = cost / best.cost, linear.cost / best.cost
+    ends = dict(zip(signals.states, linear.states[-1].tolist(), strict=True))
+    errors = {signal: abs(run.final_error(signal, setpoint))
+              for signal, setpoint in setpoints.items()}
+    linear_errors = {signal: abs(ends[signal] - setpoint)
+                     for signal, setpoint in setpoints.items()}
+    end, linear_end = (_end(some, plan, signals) for some in (errors, linear_errors))
+    title = (f'{system.name}: {change}\nWithin the same limits the learned controller costs '
+             f'{ratio:.3f} times the optimum and {end},\n'
+             f'the linear law {linear_ratio:.3g} times and {linear_end}')
+    _draw(picture, title, run, {'linear law': linear, 'optimum': best}, signals, scenario,
+          model.states, tuning, code)
     counts = summary(bag).counts
     result: dict[str, object] = {
         'unit': {signal: signals.states[signal] for signal in setpoints},
         'setpoint': setpoints,
-        'final_error': {signal: abs(run.final_error(signal, setpoint))
-                        for signal, setpoint in setpoints.items()},
-        'linear_final_error': {
-            signal: float(abs(linear.states[-1, list(signals.states).index(signal)] - setpoint))
-            for signal, setpoint in setpoints.items()},
+        'final_error': errors, 'linear_final_error': linear_errors,
         'settling_time_seconds': {
             signal: run.settling_time(signal, setpoint, plan.step_time,
                                       plan.states[signal].tolerance)
             for signal, setpoint in setpoints.items()},
         'cost': cost, 'optimal_cost': best.cost, 'linear_cost': linear.cost,
+        'cost_by_optimum': ratio, 'linear_cost_by_optimum': linear_ratio,
         'measurements': len(run.seconds), 'commands': len(run.command_seconds),
         'bag_messages': sum(counts.values()),
         'wall_seconds': round(time.monotonic() - begin, 3), **differences,
@@ -173,16 +173,12 @@ def run_plant(name: str, export: bool, output: Path, speed: float) -> dict[str, 
     return result
 
 
-def _conclusion(task: str, run: DemoRun, linear: OptimalTrajectory, setpoints: Mapping[str, float],
-                signals: Signals) -> str:
-    """Say how near the set-points both controllers end."""
-    own, other = (' and '.join(
-        printed(difference_text(abs(error), signals.states[signal], '.2g'))
-        for signal, error in errors.items()) for errors in (
-        {signal: run.final_error(signal, goal) for signal, goal in setpoints.items()},
-        {signal: float(linear.states[-1, list(signals.states).index(signal)] - goal)
-         for signal, goal in setpoints.items()}))
-    return f'{task}\nThe learned controller ends {own} off, the linear law {other}'
+def _end(errors: Mapping[str, float], plan: _Parameters, signals: Signals) -> str:
+    """Return the final errors above the tolerances in words."""
+    off = [printed(difference_text(error, signals.states[signal], '.2g'))
+           + f' of {signal}' * (len(errors) > 1)
+           for signal, error in errors.items() if not error <= plan.states[signal].tolerance]
+    return f'stays {" and ".join(off)} off' if off else 'settles'
 
 
 def _draw(path: Path, title: str, run: DemoRun, trajectories: Mapping[str, OptimalTrajectory],

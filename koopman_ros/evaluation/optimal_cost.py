@@ -9,9 +9,12 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+from scipy import sparse
 
 from koopman_ros.core.arrays import Array
+from koopman_ros.core.declaration import UNBOUNDED
 from koopman_ros.core.integration import integrate
+from koopman_ros.core.quadratic_program import solve_quadratic_program
 from koopman_ros.core.solvers import solve_riccati
 from koopman_ros.core.steady_state import Goal, steady_state
 from koopman_ros.plants.system import ControlAffineSystem
@@ -82,43 +85,42 @@ def linear_law(task: Task, limits: InputLimits | None = None,
                          system.nominal_input if before is None else before)
 
 
-def keeps(task: Task, trajectory: OptimalTrajectory, limits: InputLimits, before: Array) -> bool:
-    """Return whether the inputs of a trajectory keep range and rate, but for rounding."""
-    last = np.vstack([before, trajectory.inputs[:-1]])
-    wanted = _limited(task, trajectory.inputs, last, limits)
-    return bool(np.allclose(trajectory.inputs, wanted, rtol=1e-9, atol=0.0))
-
-
 def _limited(task: Task, u: Array, last: Array, limits: InputLimits) -> Array:
     """Return the inputs nearest to u that keep the range, and the rate after the last ones."""
     change = limits.rate * task.period * task.system.seconds_per_time_unit
     return limits.within(np.minimum(np.maximum(u, last - change), last + change))
 
 
-def optimum(task: Task) -> OptimalTrajectory:
+def optimum(task: Task, limits: InputLimits | None = None, before: Array | None = None
+            ) -> OptimalTrajectory:
     """
     Find the inputs of least cost by the iterated linear-quadratic regulator (Gauss-Newton).
 
     It begins with the linear-quadratic law at the set-point, so that an unstable plant stays with
-    it from the first step on.
+    it from the first step on. With limits each iteration solves a quadratic program, whose
+    solution keeps them.
 
+    :param limits: of the inputs; none by default.
+    :param before: (n_u,) input before the start, from which the rate counts; by default nominal.
     :raises ValueError: when that law loses the plant, or the iteration does not end.
     """
     system = task.system
     riccati = solve_riccati(system.slope(task.x_ref, task.u_ref), system.input_matrix(task.x_ref),
                             np.diag(task.Q), np.diag(task.R))
     K = riccati.K if riccati.solved else np.zeros_like(riccati.K)
-    trajectory = _constant_law(task, task.u_ref, K, task.x_ref)
+    before = system.nominal_input if before is None else before
+    trajectory = _constant_law(task, task.u_ref, K, task.x_ref, limits, before)
     if not math.isfinite(trajectory.cost):
         raise ValueError(f'{system.name}: the linear law does not stabilise the plant from '
                          f'{system.describe_state(task.x0)}: start nearer to the set-point')
     for _ in range(_MAX_ITERATIONS):
-        change, gains, gain = _improvement(task, trajectory)
+        change, gains, gain = _improvement(task, trajectory, limits, before)
         if gain <= 1e-10 * trajectory.cost:
             return trajectory
         length, better = 1.0, trajectory
         while better.cost >= trajectory.cost and length >= _SHORTEST_STEP:
-            better = _roll_out(task, trajectory.inputs + length * change, gains, trajectory.states)
+            better = _roll_out(task, trajectory.inputs + length * change, gains,
+                               trajectory.states, limits, before)
             length *= 0.5
         if better.cost >= trajectory.cost:
             break
@@ -164,7 +166,8 @@ def _after_a_period(task: Task, y: Array, u: Array) -> Array:
     return integrate(rate, y, task.period, task.substeps)
 
 
-def _improvement(task: Task, trajectory: OptimalTrajectory) -> tuple[Array, Array, float]:
+def _improvement(task: Task, trajectory: OptimalTrajectory, limits: InputLimits | None,
+                 before: Array) -> tuple[Array, Array, float]:
     """Return a change of the inputs, its gains (N, n_u, n_x), and how far the cost would fall."""
     n = task.system.n_x
     F, g, H = _expansion(task, trajectory)
@@ -178,7 +181,39 @@ def _improvement(task: Task, trajectory: OptimalTrajectory) -> tuple[Array, Arra
         gain += 0.5 * float(h[n:] @ solved[:, 0])
         slope = h[:n] - W[:n, n:] @ solved[:, 0]
         curvature = W[:n, :n] - W[:n, n:] @ gains[k]
-    return change, gains, gain
+    if limits is None:
+        return change, gains, gain
+    w = _within_limits(task, (F, g, H), trajectory, limits, before)
+    gain = -float(np.sum(g * w) + 0.5 * np.einsum('ki,kij,kj->', w, H, w))
+    # what the gains add to the inputs at the new states is part of w
+    return w[:, n:] + np.einsum('kij,kj->ki', gains, w[:, :n]), gains, gain
+
+
+def _within_limits(task: Task, expansion: tuple[Array, Array, Array],
+                   trajectory: OptimalTrajectory, limits: InputLimits, before: Array) -> Array:
+    """Return the best changes (N, n_x + n_u) of states and inputs that keep the limits."""
+    F, g, H = expansion
+    N, n, p = F.shape
+    at, begins = np.arange(N), np.arange(N + 1)
+    late = np.maximum(begins - 1, 0)
+
+    def blocks(block: Array) -> sparse.bsr_array:
+        """Return a matrix with the same block for each sample."""
+        return sparse.bsr_array((np.tile(block, (N, 1, 1)), at, begins))
+
+    states, inputs = (blocks(rows) for rows in np.split(np.eye(p), [n]))
+    followed = sparse.bsr_array((F[:-1], at[:-1], late), shape=states.shape)
+    changes = inputs - sparse.bsr_array(
+        (np.tile(np.eye(p)[n:], (N - 1, 1, 1)), at[:-1], late), shape=inputs.shape)
+    u, last = trajectory.inputs, np.vstack([before, trajectory.inputs[:-1]])
+    rate = limits.rate * task.period * task.system.seconds_per_time_unit
+    room = np.concatenate([one.ravel() for one in (
+        limits.upper - u, u - limits.lower, rate - (u - last), rate + (u - last))])
+    kept = room < UNBOUNDED
+    C = sparse.vstack([inputs, -inputs, changes, -changes], format='csr')[kept]
+    return solve_quadratic_program(
+        sparse.bsr_array((H, at, begins)), g.ravel(), states - followed, C,
+        np.maximum(room[kept], 0.0), size=trajectory.cost).reshape(N, p)
 
 
 def _expansion(task: Task, trajectory: OptimalTrajectory) -> tuple[Array, Array, Array]:
