@@ -14,8 +14,8 @@ import re
 from typing import Any, NamedTuple
 
 # A number, a date or a time; other texts with digits are names.
-_VALUE = re.compile(r'[-+.,]?\d(?:[^A-Za-z]|[eE][-+]?\d|T(?=\d)|Z|\s?[AaPp]\.?[Mm]\.?'
-                    r'|(?<=[ -])[A-Z][a-z]{2}(?=[ -]))*')
+_VALUE = re.compile(r'[-+.,]?\d(?:[^A-Za-z]|[eE][-+]?\d|T(?=\d)|Z|[AaPp]\.?[Mm]'
+                    r'|(?<=[ -])[A-Z][a-z]{2}(?=[ -]))*+')
 _UTF_16 = (b'\xff\xfe', b'\xfe\xff')
 
 

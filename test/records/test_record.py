@@ -159,6 +159,8 @@ def test_a_row_of_units_below_the_header_and_late_decimal_commas_are_understood(
     ('time,level,pump\n' + '1,0.5,2\n' * N + '2,0.5\n3,1,2\n', 'line 62 has 2 cells'),
     ('time,level,pump\n' + '1,0.5,2\n' * 300 + '1,' + '9' * 5_000_000 + ',2\n', 'field'),
     ('x' * 5_000_000, 'line 1 has more than'),
+    # a quote that is not closed makes one cell of all rows
+    ('time,level,pump\n"' + '05/25/26 10:00:00 AM,1,2\n' * N + 'stopped', 'no row of headers'),
 ])
 def test_a_file_that_is_no_table_is_named_with_the_next_step(tmp_path, text, words):
     (tmp_path / 'day.csv').write_text(text, encoding='latin-1')
