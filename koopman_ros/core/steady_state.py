@@ -46,7 +46,7 @@ class SteadyStateSettings:
     curvature: float = 0.5
     #: a fold, where the way to the goal ends, is reached if so short steps are the longest
     #: possible ones that they lead nearer by at most this share of the distance
-    fold: float = 1e-5
+    fold: float = 1e-9
     #: or if the goal comes nearer by less than this share of what the linearisation promises
     progress: float = 0.1
 
@@ -79,6 +79,7 @@ def steady_state(rate: Callable[[Array], Array], slope: Callable[[Array], Array]
     y, every = np.minimum(np.maximum(start, lower), upper), np.eye(len(start))
     wanted, anchor = every[goal.places], np.zeros(len(y)) if anchor is None else anchor
     radius, share, fresh = np.inf, 1.0, True
+    last, damping = np.zeros(len(y)), 1.0
 
     def missed(place: Array) -> float:
         return float(np.linalg.norm(wanted.dot(place) - goal.values))
@@ -113,7 +114,15 @@ def steady_state(rate: Callable[[Array], Array], slope: Callable[[Array], Array]
                     return y
             resting = ends or float(np.max(np.abs(before - y))) > radius
             if resting:
-                step = share * (before - y)
+                step, way = share * (before - y), np.zeros(len(y))
+            else:
+                way = best - before
+                if fresh and np.max(np.abs(last), initial=0.0) > settings.tolerance:
+                    # near a goal out of reach, curvature makes the whole way too far: the change
+                    # from the way before shows what part of it is right
+                    turned = 1.0 - float(way.dot(last) / last.dot(last))
+                    damping = min(1.0, damping / max(0.5, turned))
+                step = before - y + damping * way
             left = rate(y + step)
             bend = left - found - J.dot(step)
             fresh = bool(np.isfinite(left).all())
@@ -123,9 +132,9 @@ def steady_state(rate: Callable[[Array], Array], slope: Callable[[Array], Array]
                 away = float(np.linalg.norm(after - y - step))
                 fresh = away <= settings.curvature * float(np.linalg.norm(step)) and (
                     resting or missed(after) <= now + settings.tolerance + settings.progress * (
-                        missed(best) - now + away))
+                        missed(y + step) - now + away))
             if fresh:
-                y, found = y + step, left
+                y, found, last = y + step, left, way
             if resting:
                 share = min(1.0, 2.0 * share) if fresh else 0.5 * share
             else:

@@ -57,6 +57,24 @@ def test_inputs_to_spare_are_nearest_to_the_nominal_point():
         np.testing.assert_allclose(y, best.x, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize('curvature', [0.5, 2.0, 8.0])
+@pytest.mark.parametrize('goal', [(0.5, -0.5), (0.5, -3.0), (2.0, -1.0), (-0.1, -0.3)])
+def test_the_nearest_rest_to_a_goal_out_of_reach_is_exact_where_rests_lie_on_a_curve(
+        curvature, goal):
+    # y = c x^2 / 2 is at rest; a whole step along its tangent goes up to 25 times too far
+    ends = np.full(2, 50.0)
+    found = steady_state(
+        lambda y: np.array([y[1] - 0.5 * curvature * y[0] ** 2]),
+        lambda y: np.array([[-curvature * y[0], 1.0]]), np.array([1.0, 2.0]), -ends, ends,
+        Goal(np.arange(2), np.array(goal)))
+    # where the distance is stationary
+    x = np.roots([0.5 * curvature ** 2, 0.0, 1.0 - curvature * goal[1], -goal[0]])
+    x = x[np.abs(x.imag) < 1e-12].real
+    rests = np.stack((x, 0.5 * curvature * x ** 2), axis=1)
+    nearest = rests[np.argmin(np.linalg.norm(rests - goal, axis=1))]
+    np.testing.assert_allclose(found, nearest, rtol=0, atol=1e-9)
+
+
 def test_an_input_that_was_put_to_its_limit_is_released():
     # least squares without limits has both inputs beyond theirs, with them one is within
     gain, u = np.array([[-0.541, 1.147], [-0.088, -0.153]]), np.array([2.947, 2.568])

@@ -1217,8 +1217,10 @@ static int steady_state(int linear, const double *w, const double *lower, const 
 {
     double J[NX * NXU], before[NXU], at_rest[NX], every[NXU * NXU], wanted[NXU * NXU];
     double values[NXU], found[NX], radius = ENDLESS, share = 1.0, small = 0.0, now = 0.0;
+    double last[NXU], damping = 1.0;
     least_squares ranks[3], to_goal;
     int fresh = 1;
+    set_all(NXU, 0.0, last);
     ranks[0].rows = NX;
     ranks[0].M = J;
     ranks[0].m = at_rest;
@@ -1240,8 +1242,8 @@ static int steady_state(int linear, const double *w, const double *lower, const 
     copy(NXU, y, before);
     state_rate(linear, y, w, found, NULL);
     for (int count = 0; count < STEADY_STEPS; count++) {
-        double low[NXU], high[NXU], best[NXU], step[NXU], back[NXU], place[NXU], left[NX];
-        double bend[NX], length, near_goal;
+        double low[NXU], high[NXU], best[NXU], step[NXU], back[NXU], way[NXU], place[NXU];
+        double left[NX], bend[NX], length;
         int ends = 0, resting;
         if (fresh) {
             state_rate(linear, y, w, left, J);
@@ -1273,7 +1275,6 @@ static int steady_state(int linear, const double *w, const double *lower, const 
         add(NXU, -1.0, y, step);
         copy(NXU, before, back);
         add(NXU, -1.0, y, back);
-        near_goal = missed(&to_goal, best);
         length = largest(NXU, step);
         if (length <= STEADY_TOLERANCE) {
             copy(NXU, best, y);
@@ -1281,15 +1282,26 @@ static int steady_state(int linear, const double *w, const double *lower, const 
             return norm(NX, found) <= small;
         }
         if (length >= 0.5 * radius) {
-            ends = now - near_goal <= STEADY_FOLD * now;
+            ends = now - missed(&to_goal, best) <= STEADY_FOLD * now;
         }
         if (ends && norm(NX, found) <= small) {
             return 1;
         }
         resting = ends || largest(NXU, back) > radius;
+        copy(NXU, back, step);
         if (resting) {
-            copy(NXU, back, step);
             scale(NXU, share, step);
+            set_all(NXU, 0.0, way);
+        } else {
+            copy(NXU, best, way);
+            add(NXU, -1.0, before, way);
+            if (fresh && largest(NXU, last) > STEADY_TOLERANCE) {
+                /* near a goal out of reach, curvature makes the whole way too far: the change
+                 * from the way before shows what part of it is right */
+                double turned = 1.0 - dot(NXU, way, last) / dot(NXU, last, last);
+                damping = smaller(1.0, damping / larger(0.5, turned));
+            }
+            add(NXU, damping, way, step);
         }
         copy(NXU, y, place);
         add(NXU, 1.0, step, place);
@@ -1316,10 +1328,12 @@ static int steady_state(int linear, const double *w, const double *lower, const 
             add(NXU, 1.0, place, after);
             fresh = away <= STEADY_CURVATURE * norm(NXU, step) && (resting
                 || missed(&to_goal, after)
-                    <= now + STEADY_TOLERANCE + STEADY_PROGRESS * (near_goal - now + away));
+                    <= now + STEADY_TOLERANCE
+                        + STEADY_PROGRESS * (missed(&to_goal, place) - now + away));
             if (fresh) {
                 copy(NXU, place, y);
                 copy(NX, left, found);
+                copy(NXU, way, last);
             }
         }
         if (resting) {
