@@ -35,6 +35,7 @@ from koopman_ros import (
     Tuning,
 )
 from koopman_ros.core.paths import model_path
+from koopman_ros.learning.identification import identify
 from support.pictures import drawn_figures, title
 from support.quick_retraining import quick_retraining
 
@@ -171,6 +172,8 @@ WRONG = {
     'unknown column': (lambda m: read(table(), ['height'], ['pump']), ValueError, 'level [m]'),
     'inputs as states': (lambda m: read(table(), ['level'], ['level']), ValueError, 'level'),
     'unit of another kind': (lambda m: read(table(), ['level [K]'], ['pump']), ValueError, 'K'),
+    'record as episodes': (
+        lambda m: identify(RECORD.plant, RECORD), TypeError, 'record.episodes'),
     'no model': (lambda m: Controller(None, Tuning()), TypeError, 'class LiftedModel'),
     'swapped arguments': (lambda m: Controller(Tuning.for_model(m), m), TypeError, 'model must'),
     'too few limits': (lambda m: controller(m, limits=InputLimits(

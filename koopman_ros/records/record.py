@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from numbers import Real
 import os
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NoReturn, TypeAlias
 
 import numpy as np
 
@@ -49,6 +49,9 @@ class Record:
 
     __repr__ = short_repr
     _repr_pretty_ = show_printed
+
+    def __iter__(self) -> NoReturn:
+        raise TypeError('a record is not a sequence: give its record.episodes')
 
     def of(self, states: Mapping[str, str], inputs: Mapping[str, str]) -> Record:
         """

@@ -137,7 +137,7 @@ class HostedNode(Node):
 
 
 def await_delivery(publishers: Collection[Publisher]) -> None:
-    """Wait until the subscribers have all messages: what is under way is lost with its sender."""
+    """Wait until the subscribers have all messages: those under way are lost with their sender."""
     deadline = time.monotonic() + LAST_MESSAGES_TIME
     for publisher in publishers:
         publisher.wait_for_all_acked(Duration(seconds=max(0.0, deadline - time.monotonic())))
