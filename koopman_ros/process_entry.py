@@ -14,7 +14,6 @@ import select
 import signal
 import sys
 import threading
-import time
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -42,13 +41,15 @@ def run_program(module: str, interrupted: int, patience: float = 0.0) -> int:
     if module in _ONE_THREAD_PROGRAMS:
         os.environ.update(ONE_THREAD)
     main = importlib.import_module(module).main
+    caught = threading.Event()
     if patience:
-        _end_soon_after_signals(patience, interrupted)
+        _end_soon_after_signals(patience, interrupted, caught)
     handle_signals(_interrupt)
     try:
         codes.append(main())
     except KeyboardInterrupt:
         codes.append(interrupted)
+        caught.set()
         if patience:
             threading.Event().wait()  # for the end by the thread, which says so
     finally:
@@ -85,8 +86,8 @@ def _interrupt(*_: object) -> None:
     raise KeyboardInterrupt
 
 
-def _end_soon_after_signals(seconds: float, code: int) -> None:
-    """End the process some seconds after a signal, also where the main thread misses it."""
+def _end_soon_after_signals(seconds: float, code: int, caught: threading.Event) -> None:
+    """End the process when a signal was caught, or some seconds after one that was missed."""
     # the interpreter writes to it at once, while a library still calculates
     seen, written = os.pipe()
     os.set_blocking(written, False)
@@ -95,7 +96,7 @@ def _end_soon_after_signals(seconds: float, code: int) -> None:
     def end() -> None:
         while os.read(seen, 1)[0] not in SIGNALS:
             pass
-        time.sleep(seconds)
+        caught.wait(seconds)
         print('interrupted; files that were written before are kept', file=sys.stderr, flush=True)
         os._exit(code)
 
