@@ -56,9 +56,10 @@ def identify_with_characteristics(plant: PlantDescription, episodes: Sequence[Ep
     Functions of an input are added to the drift as further inputs, piecewise linear between the
     quantiles of the record. They are kept if they lower the errors at samples that are left out of
     the fit by more than two standard errors; the part that all states have in common is the
-    characteristic. At last products of such functions and states are tried in the same way, unless
-    there are too many. A drift with them is not affine in the inputs, and competes as an
-    alternative.
+    characteristic. It is found again with the drift that was found with it, as the degree of a
+    drift without it may be too low. At last products of such functions and states are tried in the
+    same way, unless there are too many. A drift with them is not affine in the inputs, and
+    competes as an alternative.
 
     :param plant: see :func:`identify`, like the options. Where it knows B nothing is tried.
     :param given: inputs whose characteristic the plant has already.
@@ -67,10 +68,14 @@ def identify_with_characteristics(plant: PlantDescription, episodes: Sequence[Ep
     found = identify(plant, episodes, **options)
     if plant.B is not None:
         return found
-    for name in plant.input_names:
-        if name not in given and (one := characteristic_of(found, name)) is not None:
-            plant = replace(plant, characteristics={**plant.characteristics, name: one})
-            found = identify(plant, episodes, **options)
+    for _ in range(2):
+        before = found
+        for name in plant.input_names:
+            if name not in given and (one := characteristic_of(found, name)) is not None:
+                plant = replace(plant, characteristics={**plant.characteristics, name: one})
+                found = identify(plant, episodes, **options)
+        if found is before:
+            break
     functions = _hats(found, plant.input_names, _FEW_POINTS)
     if functions is None:
         return found

@@ -111,6 +111,22 @@ def test_a_characteristic_is_found(g, low, high):
     assert not any(isinstance(one, NonAffineDrift) for one in found.alternatives)
 
 
+def test_a_characteristic_is_found_again_with_the_degree_that_it_allows():
+    """About the line that the drift seems to be without it, it errs by 6 % of the range."""
+    def effect(u):
+        return np.sign(u) * np.maximum(np.abs(u) - 0.4, 0.0)
+
+    found = identify_with_characteristics(
+        PLANT, [record(lambda x, u: -x - 5.0 * x ** 3 + effect(u), -1.4, 1.4)], degrees=(1, 3),
+        methods=methods(20))
+    assert found.drift.degree == 3
+    one = found.drift.characteristics['valve']
+    u = np.linspace(one.values[0], one.values[-1], 101)
+    low, high = effect(u[[0, -1]])
+    assert (one.effect(u) - u[0]) / (u[-1] - u[0]) == pytest.approx(
+        (effect(u) - low) / (high - low), abs=0.025)
+
+
 def test_the_best_linear_model_has_a_constant_input_matrix():
     """A tank whose inflow also cools it: the drift is linear, the effect of the input is not."""
     found = identify(replace(PLANT, input_matrix_degree=1),
