@@ -61,10 +61,10 @@ def _causes(found: Identified, episodes: Sequence[Episode]) -> dict[str, list[Ar
             episode.time - count * period, episode.input_time[0]))) - v for count in _DELAYS])
         early = np.vstack((v[1:], v[-1:])) - v
         for j, name in enumerate(box.inputs.names):
-            causes.setdefault(f'{name}.dead_time', []).append(late[..., j].T)
+            causes.setdefault(f'dead_time of {name}', []).append(late[..., j].T)
             # one may be measured in some episodes alone
             held = not any(episode.linear[j:j + 1])
-            causes.setdefault(f'linear = {name}', []).append(held * early[:, [j]])
+            causes.setdefault(f'linear for {name}', []).append(held * early[:, [j]])
         if not (found.constants or found.hidden or found.drift.varying_input_matrix
                 or 'input_matrix_degree' in found.searched):
             causes.setdefault('input_matrix_degree', []).append(

@@ -50,7 +50,7 @@ def _remedy(found: Identified, i: int) -> str:
     if not causes:
         states = 'set unmeasured_states, or ' * ('unmeasured_states' not in found.searched)
         return f'the inputs do not explain it: {states}record a disturbance as another input'
-    return 'change ' + ', or '.join(
+    return 'set ' + ', or '.join(
         f'{name} (explains {100.0 * share:.0f} % of its square)' for share, name in causes)
 
 
