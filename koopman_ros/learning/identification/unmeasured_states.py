@@ -78,12 +78,12 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
     stable models of the outputs, otherwise from filters; the search ends with the order that
     lowers the mean squared error by no more than two standard errors, over blocks of the record.
     Dead times, with which the order is found again, and a constant disturbance of each of several
-    episodes are kept by the same rule. Then polynomials of higher degree and small networks are
-    added to the linear drift of the best order, and networks to that with a state less or more if
-    it errs about as little; other dead times are tried with the best of them. The smallest model
-    is taken that errs by no more than two standard errors above the least. At last the gain of
-    its filter is fitted. Unmeasured states are those of the filter: dimensionless, from -1 to
-    1, because no record gives their names and units.
+    episodes, with as many states or fewer, are kept by the same rule. Then polynomials of higher
+    degree and small networks are added to the linear drift of the best order, and networks to that
+    with a state less or more if it errs about as little; other dead times are tried with the best
+    of them. The smallest model is taken that errs by no more than two standard errors above the
+    least. At last the gain of its filter is fitted. Unmeasured states are those of the filter:
+    dimensionless, from -1 to 1, because no record gives their names and units.
 
     :param plant: names, units, and B where it is known, of the measured signals.
     :param hidden: most states that are not measured, at least 1.
@@ -153,9 +153,14 @@ def identify_unmeasured(plant: PlantDescription, episodes: Sequence[Episode], hi
         extended = SplitRecord(
             *with_episode_inputs(plant, episodes), seed, hidden=True, offsets=True)
         more = PolynomialSearch(extended.later(search.record.late), first.samples)
-        if choice.gains(more.simulated(more.extended(linear), monitor),
-                        'constant offset of each episode'):
-            search, linear = more, choice.candidates[-1]
+        # of models with fewer states, too: some of the states may have stood for the offsets
+        for one in rising:
+            if one.hidden <= linear.hidden:
+                choice.gains(more.simulated(more.extended(one), monitor),
+                             'constant offset of each episode')
+        best = smallest_adequate(choice.candidates)
+        if best.record.offsets:
+            search, linear = more, best
     kept = None
     if measured is not None and isinstance(measured.drift, DriftModel):
         kept = first.simulated(Predictor(measured.drift, np.zeros((n_y, n_y))),

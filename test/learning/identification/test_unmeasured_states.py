@@ -177,6 +177,21 @@ def test_a_constant_disturbance_of_each_day_is_no_part_of_the_drift():
         assert error[0] == pytest.approx(found.noise[0], rel=0.3)
 
 
+def test_offsets_of_two_days_are_no_unmeasured_states():
+    def heated(x, u):
+        return np.array([-0.2 * x[0] + 0.5 * u, 0.0])
+
+    shifts = np.array([-1.0, 2.0])  # of the thermometer
+    days = [record(heated, samples=400, seed=seed) for seed in range(2)]
+    days = [replace(day, x=day.x + shift) for day, shift in zip(days, shifts, strict=True)]
+    found = identify_structure(PLANT, days)
+    drift = found.drift
+    assert drift.box.states.names == ('level',)
+    assert drift.degree == 1
+    assert found.shifts[:, 0] == pytest.approx(shifts - np.mean(shifts), abs=0.01)
+    assert drift.slope(drift.box.states.center) == pytest.approx(np.array([[-0.2]]), rel=0.02)
+
+
 def test_steady_states_of_an_unstable_plant_from_closed_loop():
     found = identify_unmeasured(PLANT, [record(saddle, samples=700, gain=2.0, size=1.5)], 1,
                                 highest_degree=2, dead_times=False)
