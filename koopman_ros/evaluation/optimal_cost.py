@@ -85,9 +85,14 @@ def linear_law(task: Task, limits: InputLimits | None = None,
                          system.nominal_input if before is None else before)
 
 
+def _largest_change(task: Task, limits: InputLimits) -> Array:
+    """Return by how much each input (n_u,) may change from sample to sample."""
+    return limits.rate * task.period * task.system.seconds_per_time_unit
+
+
 def _limited(task: Task, u: Array, last: Array, limits: InputLimits) -> Array:
     """Return the inputs nearest to u that keep the range, and the rate after the last ones."""
-    change = limits.rate * task.period * task.system.seconds_per_time_unit
+    change = _largest_change(task, limits)
     return limits.within(np.minimum(np.maximum(u, last - change), last + change))
 
 
@@ -206,9 +211,9 @@ def _within_limits(task: Task, expansion: tuple[Array, Array, Array],
     changes = inputs - sparse.bsr_array(
         (np.tile(np.eye(p)[n:], (N - 1, 1, 1)), at[:-1], late), shape=inputs.shape)
     u, last = trajectory.inputs, np.vstack([before, trajectory.inputs[:-1]])
-    rate = limits.rate * task.period * task.system.seconds_per_time_unit
+    change = _largest_change(task, limits)
     room = np.concatenate([one.ravel() for one in (
-        limits.upper - u, u - limits.lower, rate - (u - last), rate + (u - last))])
+        limits.upper - u, u - limits.lower, change - (u - last), change + (u - last))])
     kept = room < UNBOUNDED
     C = sparse.vstack([inputs, -inputs, changes, -changes], format='csr')[kept]
     return solve_quadratic_program(

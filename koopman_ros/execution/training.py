@@ -18,7 +18,6 @@ from koopman_ros.core.progress import show_bar
 from koopman_ros.core.units import difference_text
 from koopman_ros.execution.job import Job
 
-_CANCELLED = 'cancelled'
 _LINE_PERIOD = 5.0  # s between plain lines of progress
 
 
@@ -30,6 +29,7 @@ class JobState:
     text: str = 'starting'  #: the present stage, or the result
     ended: bool = False  #: whether it has ended
     summary: Mapping[str, Any] | None = None
+    cancelled: bool = False  #: whether it has ended because that was requested
 
     @property
     def accepted(self) -> bool:
@@ -40,11 +40,6 @@ class JobState:
     def rejected(self) -> bool:
         """Whether a lift was learned or tried and does not suffice."""
         return bool(self.summary and not self.summary['accepted'])
-
-    @property
-    def cancelled(self) -> bool:
-        """Whether it has ended because that was requested."""
-        return self.text.startswith(_CANCELLED)
 
 
 class TrainingProgress:
@@ -112,7 +107,8 @@ class TrainingJob(Job):
         if 'summary' in message:
             return JobState(1.0, outcome_text(message['summary']), True, message['summary'])
         if 'stopped' in message:
-            return JobState(self.state.share, f'{_CANCELLED}; {message["stopped"]}', True)
+            return JobState(self.state.share, f'cancelled; {message["stopped"]}', True,
+                            cancelled=True)
         return JobState(self.state.share, f'training failed: {message["error"]}', True)
 
     def _ended(self) -> JobState:
@@ -120,7 +116,7 @@ class TrainingJob(Job):
         code = self.process.wait()
         if self._cancelled:
             # by force it may have ended later
-            text = _CANCELLED if code < 0 else f'{_CANCELLED}; nothing was written'
+            text = 'cancelled' if code < 0 else 'cancelled; nothing was written'
         elif code < 0:
             name = next((s.name for s in signal.Signals if s == -code), f'signal {-code}')
             remedy = ('the limit is one day of processor time; train on fewer bags'
@@ -133,7 +129,7 @@ class TrainingJob(Job):
             if last.startswith(('ModuleNotFoundError', 'ImportError')):
                 text = (f'training needs a package that is not installed ({last}): '
                         'pip install torch cloudpickle joblib tqdm')
-        return replace(self.state, text=text, ended=True)
+        return replace(self.state, text=text, ended=True, cancelled=self._cancelled)
 
 
 def outcome_text(summary: Mapping[str, Any]) -> str:

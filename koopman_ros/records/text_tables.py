@@ -62,8 +62,7 @@ def read_text_table(path: Path, rules: TextTableRules = TextTableRules()
                           skipinitialspace=True)
         for row in rows:
             cells, line = [cell.strip() for cell in row], head.first + rows.line_num
-            if cells[:len(head.headers)] == head.headers or not any(cells) or (
-                    cells[0].startswith('#') and cells[0] != '#'):
+            if cells[:len(head.headers)] == head.headers or not any(cells) or _is_comment(cells):
                 continue
             if len(cells) == width:
                 kept[line] = cells
@@ -113,7 +112,7 @@ def _head(lines: Sequence[str], separator: str) -> _Head | None:
         while top and not valued[top - 1] and _widths(rows[top - 1]) & _widths(rows[k]):
             top -= 1
         block = [row[:width] for row in rows[top:k]]
-        named = [row for row in block if not row[0].startswith('#') or row[0] == '#'] or [
+        named = [row for row in block if not _is_comment(row)] or [
             [row[0].lstrip('# '), *row[1:]] for row in block[-1:]]
         if named:
             # a title above the headers fills fewer cells
@@ -133,6 +132,11 @@ def _head(lines: Sequence[str], separator: str) -> _Head | None:
             map(_VALUE.fullmatch, rows[0])):
         return _Head(separator, rows[0], [''] * len(rows[0]), ends[0], len(rows) - 1)
     return None
+
+
+def _is_comment(row: Sequence[str]) -> bool:
+    """Return whether a row is a comment; a column of numbers of rows may be called #."""
+    return row[0].startswith('#') and row[0] != '#'
 
 
 def _widths(row: Sequence[str]) -> set[int]:

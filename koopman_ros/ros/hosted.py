@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Coroutine
+from collections.abc import Callable, Coroutine, Iterable
 import contextlib
 from dataclasses import dataclass, field
 import functools
@@ -26,7 +26,6 @@ from rclpy.timer import Timer
 from koopman_ros.core.plugins import contained
 
 _POLL = 0.02  # s between two steps of an asynchronous callback
-LAST_MESSAGES_TIME = 0.5  # s for the last messages to reach their subscribers
 
 
 @dataclass(frozen=True)
@@ -44,10 +43,11 @@ class HostedNode(Node):
 
     :ivar hosting: None where the node is alone.
     :ivar steady_clock: runs while simulated time is paused.
+    :ivar last_messages_time: s for the last messages to reach their subscribers.
     """
 
     def __init__(self, name: str, hosting: HostContext | None, **options: Any) -> None:
-        self.hosting = hosting
+        self.hosting, self.last_messages_time = hosting, 0.5
         # rclpy's EventsExecutor has a thread for each clock, and warns of many timers of one
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         super().__init__(name, **options)
@@ -119,6 +119,12 @@ class HostedNode(Node):
         timer.callback = lambda: None
         return bool(super().destroy_timer(timer))
 
+    def await_delivery(self, publishers: Iterable[Publisher]) -> None:
+        """Wait until subscribers have all messages: those under way are lost with their sender."""
+        deadline = time.monotonic() + self.last_messages_time
+        for publisher in publishers:
+            publisher.wait_for_all_acked(Duration(seconds=max(0.0, deadline - time.monotonic())))
+
     def guarded(self, callback: Callable[..., Any]) -> Callable[..., Any]:
         """Return a callback whose exceptions end no other node of the process."""
         if (hosting := self.hosting) is None:
@@ -134,13 +140,6 @@ class HostedNode(Node):
                 return None
 
         return call
-
-
-def await_delivery(publishers: Collection[Publisher]) -> None:
-    """Wait until the subscribers have all messages: those under way are lost with their sender."""
-    deadline = time.monotonic() + LAST_MESSAGES_TIME
-    for publisher in publishers:
-        publisher.wait_for_all_acked(Duration(seconds=max(0.0, deadline - time.monotonic())))
 
 
 def wall_timer(node: HostedNode, seconds: float, callback: Callable[[], Any], **options: Any

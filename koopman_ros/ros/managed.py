@@ -17,7 +17,7 @@ from rclpy.lifecycle.node import LifecycleNodeMixin
 from rosgraph_msgs.msg import Clock
 
 from koopman_ros.core.plugins import contained
-from koopman_ros.ros.hosted import await_delivery, wall_timer
+from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.rclpy_internals import end_lifecycle, take_request
 
@@ -160,7 +160,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         self._reject_requests()
         self.forget_tables()
         self.diagnostics.clear()
-        await_delivery(list(self.publishers))
+        self.await_delivery(self.publishers)
         destroyers: tuple[Callable[[Any], Any], ...] = (
             self.destroy_timer, self.destroy_service, self.destroy_subscription,
             self.destroy_publisher)

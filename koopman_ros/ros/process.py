@@ -19,7 +19,6 @@ from rclpy.utilities import remove_ros_args
 from koopman_ros import __version__
 from koopman_ros.core.paths import LOOPBACK_PROFILE
 from koopman_ros.process_entry import force_exit_after, handle_signals
-from koopman_ros.ros.hosted import await_delivery
 from koopman_ros.ros.managed import ManagedNode, one_line, START_ERRORS
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.parameter_files import ignored_sections
@@ -114,7 +113,7 @@ def take_down(name: str, node: LoopNode | None, executor: Executor | None,
         # its threads would call into the interpreter while that ends
         executor.shutdown()
     if node is not None:
-        await_delivery(list(node.publishers))
+        node.await_delivery(node.publishers)
         node.destroy_node()
     rclpy.try_shutdown()
     # the caller may continue

@@ -39,7 +39,7 @@ from koopman_ros.parameters.signal_topics import (
     PREDICTED_TRAJECTORY,
     SignalTopics,
 )
-from koopman_ros.ros.hosted import await_delivery, HostedNode, wall_timer
+from koopman_ros.ros.hosted import HostedNode, wall_timer
 from koopman_ros.ros.managed import one_line
 
 # JointState is the one stamped type of common_interfaces that carries named float64 values,
@@ -152,7 +152,7 @@ class EndpointMonitor:
     def destroy(self) -> None:
         """Destroy the publishers and subscriptions, and look no more."""
         self._node.destroy_timer(self._timer)
-        await_delivery(self._publishers)
+        self._node.await_delivery(self._publishers)
         for publisher in self._publishers:
             self._node.destroy_publisher(publisher)
         for subscription in self.subscriptions:

@@ -87,7 +87,8 @@ def mutated(text: str, rng: random.Random) -> str:
     """
     Return a table in which something has changed.
 
-    Digits, decimal marks and signs stay: nobody can tell that a number was another one.
+    Digits, decimal marks and signs are left alone: a changed one gives another valid number, which
+    no reader could recognise as wrong.
     """
     for _ in range(rng.choice([1, 1, 1, 2, 3])):
         lines, at = text.split('\n'), rng.randrange(len(text))

@@ -150,9 +150,9 @@ import os, signal, sys, time
 import rclpy
 from std_msgs.msg import String
 from koopman_ros.ros import hosted, process, topics
-hosted.LAST_MESSAGES_TIME = 20.0
 rclpy.init()
 node = hosted.HostedNode('sender', None)
+node.last_messages_time = 20.0
 endpoints = topics.EndpointMonitor(node, lambda: None)
 publisher = endpoints.publish('text', String, topics.profile(200, reliable=True))
 while not publisher.get_subscription_count():

@@ -22,7 +22,6 @@ from koopman_ros.learning.identification.innovations_form import Predictor
 from koopman_ros.learning.identification.network_drift import NetworkDrift
 from koopman_ros.learning.lift.levenberg_marquardt import (
     minimise,
-    MinimumStatus,
     normal_equations,
     NormalEquations,
 )
@@ -222,8 +221,7 @@ def innovations_form(model: _Model, gain: Array, segments: Segments, starts: Arr
     problem = _Problem(model, segments, gain, starts, deviation, settling, smooth, penalty)
     found = minimise(problem.add_residuals, problem.start(), max_iterations=iterations,
                      tolerance=tolerance, patience=3, monitor=monitor)
-    if found.status is MinimumStatus.INTERRUPTED and not (monitor and monitor(0, found.cost)):
-        # from the keyboard, not for lack of time
+    if found.from_keyboard:
         raise KeyboardInterrupt
     theta: Array = found.theta.numpy()
     return Refined(*problem.split(theta), found.cost, problem, theta)

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 import math
 
@@ -42,6 +42,7 @@ class LeastSquaresResult:
     #: at the limit of steps, the share of the cost that the last `patience` accepted ones took
     #: off; NaN otherwise, and where there was none
     decrease: float = math.nan
+    from_keyboard: bool = False  #: whether the keyboard interrupted it, not the monitor
 
 
 class NormalEquations:
@@ -141,7 +142,7 @@ def minimise(residuals: Residuals, theta: Tensor, *, max_iterations: int,
             if monitor is not None and monitor(iteration, now.cost):
                 return result(MinimumStatus.INTERRUPTED)
     except KeyboardInterrupt:
-        return result(MinimumStatus.INTERRUPTED)
+        return replace(result(MinimumStatus.INTERRUPTED), from_keyboard=True)
     before = costs[-1 - min(patience, len(costs) - 1)]
     return result(MinimumStatus.MAX_ITERATIONS, (
         (before - costs[-1]) / before if before > costs[-1] else math.nan))
